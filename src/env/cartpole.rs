@@ -1,0 +1,156 @@
+//! `cartpole`: balance a pole on a cart by pushing the cart with any force up to 10 N.
+//!
+//! The continuous cart-pole of the PETS literature as mbrl-lib has it: Gym's equations, the force
+//! proportional to the action, reward 1 while the pole stands, 200 steps.
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::arm::{Pose, Primitive};
+use super::scene::Body;
+use super::{Env, Feature, KnownReward, Snapshot, Spec, Step};
+use crate::error::Result;
+use crate::rng;
+
+const GRAVITY: f64 = 9.8;
+const CART: f64 = 1.0;
+const POLE: f64 = 0.1;
+/// Half the pole's length, m.
+const HALF_LENGTH: f64 = 0.5;
+const DT: f64 = 0.02;
+/// Force of a full action, N.
+const MAX_FORCE: f64 = 10.0;
+/// The cart may be this far from the centre, m.
+const MAX_POSITION: f64 = 2.4;
+/// The pole may lean this far, rad (12 degrees).
+const MAX_ANGLE: f64 = 12.0 * std::f64::consts::PI / 180.0;
+
+/// Cart position (m) and velocity (m/s), pole angle from upright (rad) and its velocity (rad/s).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CartPoleState {
+    /// Cart position.
+    pub position: f64,
+    /// Cart velocity.
+    pub velocity: f64,
+    /// Pole angle from upright.
+    pub angle: f64,
+    /// Pole angular velocity.
+    pub spin: f64,
+    elapsed: usize,
+}
+
+impl CartPoleState {
+    /// A state at the start of an episode.
+    pub fn new([position, velocity, angle, spin]: [f64; 4]) -> Self {
+        Self { position, velocity, angle, spin, elapsed: 0 }
+    }
+
+    /// Pushes the cart with `force` (N) for one step of 0.02 s (explicit Euler, as in Gym).
+    pub fn step(&mut self, force: f64) {
+        let (sin, cos) = self.angle.sin_cos();
+        let total = CART + POLE;
+        let pushed = (force + POLE * HALF_LENGTH * self.spin.powi(2) * sin) / total;
+        let turning =
+            (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE * cos * cos / total));
+        let sliding = pushed - POLE * HALF_LENGTH * turning * cos / total;
+        self.position += DT * self.velocity;
+        self.velocity += DT * sliding;
+        self.angle += DT * self.spin;
+        self.spin += DT * turning;
+        self.elapsed += 1;
+    }
+
+    fn observe(&self) -> Vec<f32> {
+        [self.position, self.velocity, self.angle, self.spin].map(|x| x as f32).to_vec()
+    }
+}
+
+/// The environment: observes the state; an action is a force divided by 10 N.
+pub struct CartPole {
+    spec: Spec,
+    state: CartPoleState,
+}
+
+impl Default for CartPole {
+    fn default() -> Self {
+        let observation = [("position", 1.0), ("velocity", 1.0), ("angle", 0.1), ("angular velocity", 1.0)]
+            .map(|(name, scale)| Feature::new(name).around(0.0, scale));
+        Self {
+            spec: Spec {
+                name: "cartpole".into(),
+                observation: observation.into(),
+                action_size: 1,
+                horizon: 200,
+                dt: DT,
+                stages: vec!["standing".into()],
+            },
+            state: CartPoleState::new([0.0; 4]),
+        }
+    }
+}
+
+impl Env for CartPole {
+    fn spec(&self) -> &Spec {
+        &self.spec
+    }
+
+    fn reset(&mut self, seed: u64) -> Vec<f32> {
+        let mut rng = rng::stream(seed, "reset");
+        self.state = CartPoleState::new([0; 4].map(|_| rng::uniform(&mut rng, -0.05, 0.05)));
+        self.state.observe()
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step> {
+        self.spec.check_action(action)?;
+        self.state.step(MAX_FORCE * f64::from(action[0]).clamp(-1.0, 1.0));
+        let observation = self.state.observe();
+        let terminated = self.terminated(&observation);
+        Ok(Step {
+            reward: f32::from(!terminated),
+            terminated,
+            truncated: !terminated && self.state.elapsed >= self.spec.horizon,
+            success: !terminated,
+            stage: usize::from(!terminated),
+            observation,
+        })
+    }
+
+    fn scene(&self) -> Vec<Body> {
+        let rail = Primitive::cuboid([MAX_POSITION, 0.02, 0.02], [0.0; 3]);
+        let cart = Primitive::cuboid([0.2, 0.12, 0.1], [0.0; 3]);
+        let pole = Primitive::capsule(0.03, [0.0; 3], [0.0, 0.0, 2.0 * HALF_LENGTH]);
+        vec![
+            Body::solid("rail", "#39424e", vec![rail]),
+            Body::solid("cart", "#3c6fd8", vec![cart]),
+            Body::solid("pole", "#c9a97c", vec![pole]),
+        ]
+    }
+
+    fn poses(&self) -> Vec<Pose> {
+        let at = Vector3::new(self.state.position, 0.0, 0.5);
+        let lean = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), self.state.angle);
+        let cart = Pose::translation(at.x, at.y, at.z);
+        vec![Pose::translation(0.0, 0.0, 0.38), cart, Pose::from_parts(at.into(), lean)]
+    }
+}
+
+impl KnownReward for CartPole {
+    fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
+        f32::from(!self.terminated(next_obs))
+    }
+
+    fn terminated(&self, next_obs: &[f32]) -> bool {
+        f64::from(next_obs[0]).abs() > MAX_POSITION || f64::from(next_obs[2]).abs() > MAX_ANGLE
+    }
+}
+
+impl Snapshot for CartPole {
+    type State = CartPoleState;
+
+    fn snapshot(&self) -> CartPoleState {
+        self.state
+    }
+
+    fn restore(&mut self, state: &CartPoleState) {
+        self.state = *state;
+    }
+}

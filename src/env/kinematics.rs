@@ -1,0 +1,134 @@
+//! Where the arm's links are, how the hand moves with the joints, and how heavy the joints feel.
+
+use nalgebra::{SMatrix, Vector3};
+
+use super::arm::{ArmDescription, Inertia, JOINTS, JointVector, Pose};
+
+/// 3 x 7: velocity of a point, or angular velocity of a link, from joint velocities.
+pub type Jacobian = SMatrix<f64, 3, JOINTS>;
+
+/// 7 x 7: joint-space inertia.
+pub type MassMatrix = SMatrix<f64, JOINTS, JOINTS>;
+
+/// Downward acceleration, m/s2.
+pub const GRAVITY: f64 = 9.81;
+
+/// Everything that follows from the joint angles alone. World frame throughout.
+#[derive(Clone, Debug)]
+pub struct Kinematics {
+    /// Pose of each link.
+    pub links: [Pose; JOINTS],
+    /// Pose of the grip site: the controlled point between the pads.
+    pub grip: Pose,
+    /// Linear Jacobian of the grip site, m/rad.
+    pub linear: Jacobian,
+    /// Angular Jacobian of the hand, rad/rad.
+    pub angular: Jacobian,
+    /// Joint-space inertia with rotor inertias, kg m2.
+    pub mass: MassMatrix,
+    /// Torques that hold the arm up against gravity, N m.
+    pub gravity: JointVector,
+    /// Mass, centre of mass and inertia of each link as they stand in the world.
+    bodies: [Inertia; JOINTS],
+    /// Direction of each joint's axis.
+    axes: [Vector3<f64>; JOINTS],
+}
+
+impl Kinematics {
+    /// Torques (N m) that the joints need to keep moving at constant velocities `qd` (rad/s):
+    /// centrifugal and Coriolis forces, by the recursive Newton-Euler algorithm.
+    pub fn coriolis(&self, qd: &JointVector) -> JointVector {
+        let mut torque = JointVector::zeros();
+        let mut origin = self.links[0].translation.vector;
+        let (mut spin, mut spin_rate, mut acceleration) = (Vector3::zeros(), Vector3::zeros(), Vector3::zeros());
+        for (i, (body, link)) in self.bodies.iter().zip(&self.links).enumerate() {
+            let along = link.translation.vector - origin;
+            origin = link.translation.vector;
+            acceleration += spin_rate.cross(&along) + spin.cross(&spin.cross(&along));
+            let own = self.axes[i] * qd[i];
+            spin_rate += spin.cross(&own);
+            spin += own;
+            let out = body.com - origin;
+            let force = (acceleration + spin_rate.cross(&out) + spin.cross(&spin.cross(&out))) * body.mass;
+            let moment = body.tensor * spin_rate + spin.cross(&(body.tensor * spin));
+            for j in 0..=i {
+                let arm = body.com - self.links[j].translation.vector;
+                torque[j] += self.axes[j].dot(&(arm.cross(&force) + moment));
+            }
+        }
+        torque
+    }
+}
+
+/// Computes [`Kinematics`] for one arm. The fingers count as part of the hand, where they are at
+/// reset: their 0.2 kg move by two centimetres, which the joints cannot tell.
+#[derive(Clone, Debug)]
+pub struct KinematicModel {
+    base: Pose,
+    mounts: [Pose; JOINTS],
+    inertias: [Inertia; JOINTS],
+    armature: JointVector,
+    grip_site: Pose,
+}
+
+impl KinematicModel {
+    /// The kinematics of `arm`.
+    pub fn new(arm: &ArmDescription) -> Self {
+        let mut inertias = arm.links.each_ref().map(|link| link.inertia);
+        let gripper = &arm.gripper;
+        for side in [1.0, -1.0] {
+            let finger = gripper.finger_pose(side, gripper.start);
+            inertias[JOINTS - 1] = inertias[JOINTS - 1].welded(&gripper.inertia.seen_at(&finger));
+        }
+        Self {
+            base: arm.base,
+            mounts: arm.links.each_ref().map(|link| link.mount),
+            inertias,
+            armature: JointVector::from_iterator(arm.links.iter().map(|link| link.armature)),
+            grip_site: arm.grip_site,
+        }
+    }
+
+    /// Forward kinematics, Jacobians and mass matrix at joint angles `q` (rad).
+    pub fn at(&self, q: &JointVector) -> Kinematics {
+        let mut parent = self.base;
+        let links: [Pose; JOINTS] = std::array::from_fn(|i| {
+            parent = parent * self.mounts[i] * Pose::rotation(Vector3::z() * q[i]);
+            parent
+        });
+        let grip = links[JOINTS - 1] * self.grip_site;
+
+        let axes = links.map(|link| link.rotation * Vector3::z());
+        let mut linear = Jacobian::zeros();
+        let mut angular = Jacobian::zeros();
+        for (j, (axis, link)) in axes.iter().zip(&links).enumerate() {
+            let arm = grip.translation.vector - link.translation.vector;
+            linear.set_column(j, &axis.cross(&arm));
+            angular.set_column(j, axis);
+        }
+
+        // M = sum over bodies of m Jv' Jv + Jw' I Jw; body i is moved by joints 0..=i only.
+        let mut mass = MassMatrix::from_diagonal(&self.armature);
+        let mut gravity = JointVector::zeros();
+        let bodies: [Inertia; JOINTS] = std::array::from_fn(|i| self.inertias[i].seen_at(&links[i]));
+        for (i, body) in bodies.iter().enumerate() {
+            let mut velocity = [Vector3::zeros(); JOINTS];
+            let mut momentum = [Vector3::zeros(); JOINTS];
+            for j in 0..=i {
+                velocity[j] = axes[j].cross(&(body.com - links[j].translation.vector));
+                momentum[j] = body.tensor * axes[j];
+                gravity[j] += body.mass * GRAVITY * velocity[j].z;
+            }
+            for a in 0..=i {
+                for b in 0..=a {
+                    let m = body.mass * velocity[a].dot(&velocity[b]) + axes[a].dot(&momentum[b]);
+                    mass[(a, b)] += m;
+                    if a != b {
+                        mass[(b, a)] += m;
+                    }
+                }
+            }
+        }
+        Kinematics { links, grip, linear, angular, mass, gravity, bodies, axes }
+    }
+}

@@ -1,0 +1,175 @@
+//! Worlds to act in.
+//!
+//! [`Env`] is all that an agent asks of a world; implement it and every agent here trains on it.
+//! [`KnownReward`] and [`Snapshot`] are what planners ask beyond that. [`World`] is any of the
+//! worlds of this crate, by name.
+
+pub mod arm;
+pub mod cartpole;
+pub mod kinematics;
+pub mod osc;
+pub mod pendulum;
+pub mod physics;
+pub mod scene;
+pub mod tabletop;
+pub mod vector;
+mod world;
+
+pub use world::{Task, World, WorldState};
+
+use crate::error::{Error, Result};
+
+/// What an environment looks like from outside.
+#[derive(Clone, Debug)]
+pub struct Spec {
+    /// The task's name.
+    pub name: String,
+    /// What each number of an observation is.
+    pub observation: Vec<Feature>,
+    /// Numbers in an action; each lies in [-1, 1].
+    pub action_size: usize,
+    /// Control steps in an episode; its end by the clock is a truncation, not a termination.
+    pub horizon: usize,
+    /// Seconds from one action to the next.
+    pub dt: f64,
+    /// The stages on the way to success, in order, for reports.
+    pub stages: Vec<String>,
+}
+
+/// One number of an observation.
+#[derive(Clone, Debug)]
+pub struct Feature {
+    /// Its name, with its unit where it has one.
+    pub name: String,
+    /// A typical value.
+    pub centre: f32,
+    /// A typical distance from `centre`: networks are fed (value - centre) / scale.
+    pub scale: f32,
+}
+
+impl Feature {
+    /// A feature around zero of size one.
+    pub fn new(name: impl Into<String>) -> Self {
+        Self { name: name.into(), centre: 0.0, scale: 1.0 }
+    }
+
+    /// The same feature around another centre and of another size.
+    pub fn around(self, centre: f32, scale: f32) -> Self {
+        Self { centre, scale, ..self }
+    }
+}
+
+impl Spec {
+    /// Numbers in an observation.
+    pub fn observation_size(&self) -> usize {
+        self.observation.len()
+    }
+
+    /// Whether `action` can be taken: the right length, and every number finite.
+    ///
+    /// # Errors
+    /// [`Error::BadAction`] names the length or the number that is wrong.
+    pub fn check_action(&self, action: &[f32]) -> Result<()> {
+        if action.len() != self.action_size {
+            return Err(Error::bad_action(
+                &self.name,
+                format!("an action has {} numbers, this one has {}", self.action_size, action.len()),
+            ));
+        }
+        match action.iter().position(|a| !a.is_finite()) {
+            Some(i) => Err(Error::bad_action(&self.name, format!("action[{i}] is {}", action[i]))),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What one step of an environment answers.
+#[derive(Clone, Debug)]
+pub struct Step {
+    /// The observation after the step.
+    pub observation: Vec<f32>,
+    /// The reward of the step.
+    pub reward: f32,
+    /// The task itself ended: there is no future to value.
+    pub terminated: bool,
+    /// The clock ended the episode: the future goes on, unseen.
+    pub truncated: bool,
+    /// Whether the task is fulfilled at this moment.
+    pub success: bool,
+    /// How many of the [`Spec::stages`] are fulfilled at this moment.
+    pub stage: usize,
+}
+
+impl Step {
+    /// Whether the episode is over.
+    pub fn done(&self) -> bool {
+        self.terminated || self.truncated
+    }
+}
+
+/// A world to act in.
+pub trait Env: Send {
+    /// What it looks like from outside.
+    fn spec(&self) -> &Spec;
+
+    /// Starts an episode; the seed fixes everything that is drawn in it. Returns the first observation.
+    fn reset(&mut self, seed: u64) -> Vec<f32>;
+
+    /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.
+    ///
+    /// # Errors
+    /// [`Error::BadAction`] if the action has the wrong length or is not finite; nothing has moved then.
+    fn step(&mut self, action: &[f32]) -> Result<Step>;
+
+    /// Where the hand is (m), in worlds that have one: smoothness is measured there.
+    fn hand(&self) -> Option<[f64; 3]> {
+        None
+    }
+
+    /// What there is to draw. Empty by default.
+    fn scene(&self) -> Vec<scene::Body> {
+        Vec::new()
+    }
+
+    /// Where each body of [`Env::scene`] is now.
+    fn poses(&self) -> Vec<arm::Pose> {
+        Vec::new()
+    }
+}
+
+/// A reward that can be computed from observations alone, as planners need it.
+pub trait KnownReward {
+    /// The reward of reaching `next_obs` from `obs` by `action`.
+    fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32;
+
+    /// Whether reaching `next_obs` ends the task itself. Most tasks here never do.
+    fn terminated(&self, _next_obs: &[f32]) -> bool {
+        false
+    }
+
+    /// [`KnownReward::reward`] for a batch: `obs` and `next_obs` hold `rewards.len()` rows, one after the other, as
+    /// does `actions`. Rewards are written into `rewards`.
+    ///
+    /// # Panics
+    /// If the lengths do not fit together.
+    fn rewards(&self, obs: &[f32], actions: &[f32], next_obs: &[f32], rewards: &mut [f32]) {
+        let n = rewards.len().max(1);
+        assert!(obs.len() == next_obs.len() && obs.len() % n == 0 && actions.len() % n == 0);
+        let rows = obs.chunks(obs.len() / n).zip(actions.chunks(actions.len() / n)).zip(next_obs.chunks(obs.len() / n));
+        for (reward, ((obs, action), next)) in rewards.iter_mut().zip(rows) {
+            *reward = self.reward(obs, action, next);
+        }
+    }
+}
+
+/// A world that can be put back to where it was, and then steps on bit for bit as it did.
+pub trait Snapshot {
+    /// All that the future depends on.
+    type State: Clone + Send + Sync;
+
+    /// The present state.
+    fn snapshot(&self) -> Self::State;
+
+    /// Back to a state that [`Snapshot::snapshot`] of this world, or one made alike, has given.
+    fn restore(&mut self, state: &Self::State);
+}

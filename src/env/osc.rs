@@ -1,0 +1,96 @@
+//! Operational-space control: torques that make the hand behave like a damped spring in Cartesian
+//! space (Khatib 1987), with robosuite's gains and conventions.
+//!
+//! The torques come without the part that carries the arm's weight, since the physics switches
+//! gravity off for the arm; that part still counts towards the torque limits, as in robosuite.
+
+use nalgebra::{Matrix3, Matrix6, SMatrix, UnitQuaternion, Vector3, Vector6};
+
+use super::arm::{ArmDescription, JOINTS, JointVector};
+use super::kinematics::Kinematics;
+
+/// Stiffness of the hand's spring per unit of inertia, 1/s2, for position and for orientation.
+const STIFFNESS: f64 = 150.0;
+/// Stiffness of the spring that draws the elbow to its reset posture, 1/s2.
+const POSTURE_STIFFNESS: f64 = 10.0;
+
+/// Where the hand should go: position (m) and orientation of the grip site, world frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Goal {
+    /// Position of the grip site.
+    pub position: Vector3<f64>,
+    /// Orientation of the grip site.
+    pub orientation: UnitQuaternion<f64>,
+}
+
+/// The controller: fixed impedance, critically damped, position and orientation decoupled.
+#[derive(Clone, Debug)]
+pub struct OperationalSpaceController {
+    /// Where the hand should go.
+    pub goal: Goal,
+    /// The joint angles that the null space is drawn to, rad.
+    pub posture: JointVector,
+    max_torque: JointVector,
+}
+
+impl OperationalSpaceController {
+    /// A controller that keeps `goal` and `posture` until they are changed.
+    pub fn new(arm: &ArmDescription, goal: Goal, posture: JointVector) -> Self {
+        Self {
+            goal,
+            posture,
+            max_torque: JointVector::from_iterator(arm.links.iter().map(|link| link.max_torque)),
+        }
+    }
+
+    /// Joint torques (N m), beyond those that carry its weight, for the arm at joint angles `q` (rad), moving at `qd` (rad/s), whose
+    /// kinematics are `at`.
+    pub fn torques(&self, at: &Kinematics, q: &JointVector, qd: &JointVector) -> JointVector {
+        let damping = 2.0 * STIFFNESS.sqrt();
+        let position_error = self.goal.position - at.grip.translation.vector;
+        let rotation_error = rotation_error(&at.grip.rotation, &self.goal.orientation);
+        let force = position_error * STIFFNESS - at.linear * qd * damping;
+        let moment = rotation_error * STIFFNESS - at.angular * qd * damping;
+
+        // Operational-space inertia: (J M^-1 J')^-1, for position, orientation, and both together.
+        let mut jacobian = SMatrix::<f64, 6, JOINTS>::zeros();
+        jacobian.fixed_rows_mut::<3>(0).copy_from(&at.linear);
+        jacobian.fixed_rows_mut::<3>(3).copy_from(&at.angular);
+        let inverse_mass = at.mass.cholesky().expect("a mass matrix is positive definite");
+        let mobility: Matrix6<f64> = jacobian * inverse_mass.solve(&jacobian.transpose());
+        let for_position: Matrix3<f64> = mobility.fixed_view::<3, 3>(0, 0).into();
+        let for_rotation: Matrix3<f64> = mobility.fixed_view::<3, 3>(3, 3).into();
+
+        let task = at.linear.transpose() * solve(for_position, force)
+            + at.angular.transpose() * solve(for_rotation, moment);
+
+        // The posture may use only what the hand does not feel.
+        let posture = (self.posture - q) * POSTURE_STIFFNESS - qd * (2.0 * POSTURE_STIFFNESS.sqrt());
+        let felt: Vector6<f64> = jacobian * posture;
+        let null_space = at.mass * posture - jacobian.transpose() * solve(mobility, felt);
+
+        // A motor that already carries the arm has less to spare in that direction.
+        let motor = (task + null_space + at.coriolis(qd) + at.gravity)
+            .zip_map(&self.max_torque, |torque, max| torque.clamp(-max, max));
+        motor - at.gravity
+    }
+}
+
+/// Solves `mobility x = b`. The ridge keeps a stretched-out arm, whose mobility is singular, from
+/// answering with infinite forces; elsewhere it is far below the arm's own mobility (about 0.03/kg).
+fn solve<const N: usize>(mobility: SMatrix<f64, N, N>, b: SMatrix<f64, N, 1>) -> SMatrix<f64, N, 1> {
+    let ridge = SMatrix::<f64, N, N>::identity() * 1e-6;
+    (mobility + ridge)
+        .cholesky()
+        .expect("a mobility matrix is positive semi-definite")
+        .solve(&b)
+}
+
+/// The rotation that is missing from `now` to `goal`: sin(angle) times the axis, world frame.
+fn rotation_error(now: &UnitQuaternion<f64>, goal: &UnitQuaternion<f64>) -> Vector3<f64> {
+    let (now, goal) = (now.to_rotation_matrix(), goal.to_rotation_matrix());
+    (0..3)
+        .map(|axis| now.matrix().column(axis).cross(&goal.matrix().column(axis)))
+        .sum::<Vector3<f64>>()
+        * 0.5
+}

@@ -1,0 +1,130 @@
+//! `push`: push the cube across the table to a goal, with closed fingers.
+//!
+//! Cube and goal uniform in a square of 0.3 m, at least 0.1 m apart; success within 5 cm.
+
+use nalgebra::Vector3;
+
+use super::{
+    HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, named, object_features, object_state_of,
+    object_values, on_table, towards, vector, xyz,
+};
+use crate::env::Feature;
+use crate::env::arm::Primitive;
+use crate::env::physics::{Physics, TABLE_TOP};
+use crate::env::scene::Body;
+use crate::rng::{Rng, uniform};
+
+const HALF: f64 = 0.02;
+/// Half width of the square of cubes and goals, m.
+const REACH: f64 = 0.15;
+/// Distance that counts as there, m.
+const TOLERANCE: f64 = 0.05;
+/// Friction between cube and table: lower than robosuite's 1, at which a light cube sticks.
+const FRICTION: f64 = 0.5;
+
+const CUBE: usize = HAND_VELOCITY.end;
+const HAND_TO_CUBE: usize = CUBE + 12;
+const GOAL: usize = HAND_TO_CUBE + 3;
+const CUBE_TO_GOAL: usize = GOAL + 3;
+
+/// The task. See the module's page.
+pub struct Push;
+
+impl TableTask for Push {
+    fn name(&self) -> &'static str {
+        "push"
+    }
+
+    fn horizon(&self) -> usize {
+        150
+    }
+
+    fn stages(&self) -> &'static [&'static str] {
+        &["reached", "pushed"]
+    }
+
+    fn uses_gripper(&self) -> bool {
+        false
+    }
+
+    fn place(&self, physics: &mut Physics, rng: &mut Rng) -> Setup {
+        physics.set_table_friction(FRICTION);
+        let pose = on_table(rng, REACH, HALF, 0.0);
+        let cube = pose.translation.vector;
+        let goal = loop {
+            let goal = Vector3::new(uniform(rng, -REACH, REACH), uniform(rng, -REACH, REACH), cube.z);
+            if (goal - cube).norm() >= 0.1 {
+                break goal;
+            }
+        };
+        Setup { objects: vec![physics.add_box([HALF; 3], 1000.0, FRICTION, &pose)], goal: Some(goal) }
+    }
+
+    fn features(&self) -> Vec<Feature> {
+        let table = TABLE_TOP as f32;
+        object_features("cube")
+            .into_iter()
+            .chain(xyz("hand to cube", [0.0; 3], 0.1))
+            .chain(xyz("goal", [0.0, 0.0, table], 0.1))
+            .chain(xyz("cube to goal", [0.0; 3], 0.1))
+            .collect()
+    }
+
+    fn observe(&self, view: &View) -> Vec<f64> {
+        let mut values = object_values(view, 0);
+        let cube = Vector3::new(values[0], values[1], values[2]);
+        let goal = view.setup.goal.expect("push has a goal");
+        for part in [cube - view.hand.translation.vector, goal, goal - cube] {
+            values.extend(part.iter());
+        }
+        values
+    }
+
+    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+        let goal = view.setup.goal.expect("push has a goal");
+        let cube = view.physics.object_state(view.setup.objects[0]).pose.translation.vector;
+        let mut values = object_state_of(view, 0, "cube", "gripper_to_cube_pos");
+        values.extend(named("goal_pos", goal.iter()));
+        values.extend(named("cube_to_goal", (goal - cube).iter()));
+        values
+    }
+
+    fn judge(&self, obs: &[f32]) -> Judgement {
+        let hand_to_cube = vector(obs, HAND_TO_CUBE).norm();
+        let cube_to_goal = vector(obs, CUBE_TO_GOAL).norm();
+        let success = cube_to_goal < TOLERANCE;
+        let shaped =
+            if success { 1.0 } else { 0.25 * closeness(hand_to_cube) + 0.75 * closeness(cube_to_goal) };
+        Judgement { shaped, success, stage: if success { 2 } else { usize::from(hand_to_cube < 0.05) } }
+    }
+
+    /// Behind the cube as seen from the goal, down, and through it towards the goal.
+    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
+        let to_cube = vector(obs, HAND_TO_CUBE);
+        let to_goal = vector(obs, CUBE_TO_GOAL).xy();
+        if to_goal.norm() < 0.015 {
+            return towards(Vector3::zeros(), 0.0);
+        }
+        let ahead = to_goal.normalize();
+        let behind = to_cube - Vector3::new(ahead.x, ahead.y, 0.0) * 0.06;
+        let height = to_cube.z + 0.002;
+        // How far the hand is beside the line of push, and how far behind the cube.
+        let back = to_cube.xy().dot(&ahead);
+        let aside = (to_cube.xy() - ahead * back).norm();
+        let low = height > -0.03;
+        if low && back > 0.01 && aside < 0.012 {
+            let step = to_cube.xy() - ahead * back + ahead * to_goal.norm().min(0.05);
+            towards(Vector3::new(step.x, step.y, height), 0.0)
+        } else if behind.xy().norm() > 0.012 {
+            // Travel above the cube's height.
+            let clear = if behind.xy().norm() < 0.03 { height } else { height + 0.07 };
+            towards(Vector3::new(behind.x, behind.y, clear), 0.0)
+        } else {
+            towards(Vector3::new(behind.x, behind.y, height), 0.0)
+        }
+    }
+
+    fn drawn(&self, _setup: &Setup) -> Vec<Body> {
+        vec![Body::solid("cube", "#3c6fd8", vec![Primitive::cuboid([HALF; 3], [0.0; 3])]), Body::goal(0.02)]
+    }
+}

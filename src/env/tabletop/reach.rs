@@ -1,0 +1,75 @@
+//! `reach`: bring the hand to a point in the air.
+//!
+//! Goal uniform in a box 0.3 x 0.4 x 0.3 m above the table; success within 2 cm of it.
+
+use nalgebra::Vector3;
+
+use super::{HAND_POSITION, Judgement, Setup, TableTask, View, closeness, named, towards, vector, xyz};
+use crate::env::Feature;
+use crate::env::physics::Physics;
+use crate::env::scene::Body;
+use crate::rng::{Rng, uniform};
+
+/// Distance that counts as there, m.
+const TOLERANCE: f64 = 0.02;
+const GOAL: usize = HAND_POSITION.end + 3;
+const HAND_TO_GOAL: usize = GOAL + 3;
+
+/// The task. See the module's page.
+pub struct Reach;
+
+impl TableTask for Reach {
+    fn name(&self) -> &'static str {
+        "reach"
+    }
+
+    fn horizon(&self) -> usize {
+        100
+    }
+
+    fn stages(&self) -> &'static [&'static str] {
+        &["within 5 cm", "reached"]
+    }
+
+    fn uses_gripper(&self) -> bool {
+        false
+    }
+
+    fn place(&self, _physics: &mut Physics, rng: &mut Rng) -> Setup {
+        let goal = Vector3::new(uniform(rng, -0.15, 0.15), uniform(rng, -0.2, 0.2), uniform(rng, 0.85, 1.15));
+        Setup { objects: vec![], goal: Some(goal) }
+    }
+
+    fn features(&self) -> Vec<Feature> {
+        xyz("goal", [0.0, 0.0, 1.0], 0.15).chain(xyz("hand to goal", [0.0; 3], 0.1)).collect()
+    }
+
+    fn observe(&self, view: &View) -> Vec<f64> {
+        let goal = view.setup.goal.expect("reach has a goal");
+        let way = goal - view.hand.translation.vector;
+        goal.iter().chain(&way).copied().collect()
+    }
+
+    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+        let goal = view.setup.goal.expect("reach has a goal");
+        let way = goal - view.hand.translation.vector;
+        [named("goal_pos", goal.iter()), named("gripper_to_goal", way.iter())].concat()
+    }
+
+    fn judge(&self, obs: &[f32]) -> Judgement {
+        let distance = vector(obs, HAND_TO_GOAL).norm();
+        Judgement {
+            shaped: closeness(distance),
+            success: distance < TOLERANCE,
+            stage: usize::from(distance < 0.05) + usize::from(distance < TOLERANCE),
+        }
+    }
+
+    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
+        towards(vector(obs, HAND_TO_GOAL), 0.0)
+    }
+
+    fn drawn(&self, _setup: &Setup) -> Vec<Body> {
+        vec![Body::goal(TOLERANCE)]
+    }
+}

@@ -1,0 +1,144 @@
+//! `stack`: put the red cube on the green one. robosuite's Stack, with its numbers.
+
+use nalgebra::Vector3;
+
+use super::lift::{CUBE, LIFTED, descend_and_close, grasped};
+use super::{
+    Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, named, object_features,
+    object_state_of, object_values, on_table, towards, vector, xyz,
+};
+use crate::env::Feature;
+use crate::env::arm::Primitive;
+use crate::env::physics::{Physics, TABLE_TOP};
+use crate::env::scene::Body;
+use crate::rng::Rng;
+
+/// Half edges of the cube to be stacked, and of the one that carries it, m.
+const HALF: [f64; 2] = [0.020, 0.025];
+const REACH: f64 = 0.08;
+
+const BASE: usize = CUBE + 12;
+const HAND_TO_CUBE: usize = BASE + 12;
+const CUBE_TO_BASE: usize = HAND_TO_CUBE + 3;
+const TOUCHING: usize = CUBE_TO_BASE + 3;
+
+/// The task. See the module's page.
+pub struct Stack;
+
+impl TableTask for Stack {
+    fn name(&self) -> &'static str {
+        "stack"
+    }
+
+    fn horizon(&self) -> usize {
+        300
+    }
+
+    fn stages(&self) -> &'static [&'static str] {
+        &["reached", "grasped", "lifted", "stacked"]
+    }
+
+    fn uses_gripper(&self) -> bool {
+        true
+    }
+
+    fn place(&self, physics: &mut Physics, rng: &mut Rng) -> Setup {
+        let apart = (HALF[0] + HALF[1]) * std::f64::consts::SQRT_2;
+        let base = on_table(rng, REACH, HALF[1], 0.01);
+        let cube = loop {
+            let cube = on_table(rng, REACH, HALF[0], 0.01);
+            if (cube.translation.vector - base.translation.vector).xy().norm() > apart {
+                break cube;
+            }
+        };
+        let objects = vec![
+            physics.add_box([HALF[0]; 3], 1000.0, 1.0, &cube),
+            physics.add_box([HALF[1]; 3], 1000.0, 1.0, &base),
+        ];
+        Setup { objects, goal: None }
+    }
+
+    fn features(&self) -> Vec<Feature> {
+        gripper_features()
+            .into_iter()
+            .chain(object_features("cube"))
+            .chain(object_features("base"))
+            .chain(xyz("hand to cube", [0.0; 3], 0.1))
+            .chain(xyz("cube to base", [0.0; 3], 0.1))
+            .chain([Feature::new("cube touches base").around(0.5, 0.5)])
+            .collect()
+    }
+
+    fn observe(&self, view: &View) -> Vec<f64> {
+        let (cube, base) = (object_values(view, 0), object_values(view, 1));
+        let hand = view.hand.translation.vector;
+        let to_cube: Vec<f64> = (0..3).map(|i| cube[i] - hand[i]).collect();
+        let to_base: Vec<f64> = (0..3).map(|i| base[i] - cube[i]).collect();
+        let touching = view.physics.touching(view.setup.objects[0], view.setup.objects[1]);
+        [gripper_values(view, 0), cube, base, to_cube, to_base, vec![f64::from(touching)]].concat()
+    }
+
+    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+        let [cube, base] =
+            [0, 1].map(|i| view.physics.object_state(view.setup.objects[i]).pose.translation.vector);
+        let a = object_state_of(view, 0, "cubeA", "gripper_to_cubeA");
+        let b = object_state_of(view, 1, "cubeB", "gripper_to_cubeB");
+        // robosuite lists both poses first, then the vectors between things.
+        [&a[..7], &b[..7], &named("cubeA_to_cubeB", (base - cube).iter()), &a[7..], &b[7..]].concat()
+    }
+
+    fn judge(&self, obs: &[f32]) -> Judgement {
+        let distance = vector(obs, HAND_TO_CUBE).norm();
+        let grasped = grasped(obs);
+        let lifted = vector(obs, CUBE).z > TABLE_TOP + LIFTED;
+        let stacked = !grasped && lifted && obs[TOUCHING] > 0.5;
+        let reach = 0.25 * closeness(distance) + if grasped { 0.25 } else { 0.0 };
+        // robosuite leaves the factor 10 out of this distance; the term is nearly flat.
+        let align = 0.5 * (1.0 - vector(obs, CUBE_TO_BASE).xy().norm().tanh());
+        let lift = if lifted { 1.0 + align } else { 0.0 };
+        let stack = if stacked { 2.0 } else { 0.0 };
+        Judgement {
+            shaped: reach.max(lift).max(stack) / 2.0,
+            success: stacked,
+            stage: if stacked {
+                4
+            } else if lifted && grasped {
+                3
+            } else if grasped {
+                2
+            } else {
+                usize::from(distance < 0.02)
+            },
+        }
+    }
+
+    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
+        let to_base = vector(obs, CUBE_TO_BASE);
+        let on_top = HALF[0] + HALF[1];
+        let over = to_base.xy().norm() < 0.01;
+        if over && (to_base.z + on_top).abs() < 0.004 {
+            // There: let go, and draw back once the fingers are open.
+            let open = obs[super::lift::GRIPPER] > 0.03;
+            return towards(Vector3::z() * if open { 0.05 } else { 0.0 }, -1.0);
+        }
+        if grasped(obs) {
+            let height = to_base.z + on_top;
+            // Lift clear of the base, carry across, lower.
+            return if over {
+                towards(Vector3::new(to_base.x, to_base.y, height.max(-0.03)), 1.0)
+            } else if height < -0.03 || to_base.xy().norm() < 0.03 {
+                towards(Vector3::new(to_base.x, to_base.y, height + 0.05), 1.0)
+            } else {
+                towards(Vector3::z() * (height + 0.05), 1.0)
+            };
+        }
+        descend_and_close(vector(obs, HAND_TO_CUBE))
+    }
+
+    fn drawn(&self, _setup: &Setup) -> Vec<Body> {
+        vec![
+            Body::solid("cube", "#d8443c", vec![Primitive::cuboid([HALF[0]; 3], [0.0; 3])]),
+            Body::solid("base", "#3f9d5a", vec![Primitive::cuboid([HALF[1]; 3], [0.0; 3])]),
+        ]
+    }
+}

@@ -1,0 +1,197 @@
+//! The worlds of this crate by name.
+
+use serde::{Deserialize, Serialize};
+
+use super::arm::Pose;
+use super::cartpole::{CartPole, CartPoleState};
+use super::pendulum::{Pendulum, PendulumState};
+use super::scene::Body;
+use super::tabletop::{Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
+use super::{Env, KnownReward, Snapshot, Spec, Step};
+use crate::error::{Error, Result};
+
+/// The tasks of this crate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Task {
+    /// Bring the hand to a point: [`super::tabletop::Reach`].
+    Reach,
+    /// Push a cube to a goal: [`super::tabletop::Push`].
+    Push,
+    /// Take a cube from the table: [`super::tabletop::Lift`].
+    Lift,
+    /// Put one cube on another: [`super::tabletop::Stack`].
+    Stack,
+    /// Swing up a pendulum: [`super::pendulum`].
+    Pendulum,
+    /// Balance a pole: [`super::cartpole`].
+    Cartpole,
+}
+
+impl Task {
+    /// All tasks.
+    pub const ALL: [Task; 6] =
+        [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum, Task::Cartpole];
+
+    /// Its name, as the command line has it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Task::Reach => "reach",
+            Task::Push => "push",
+            Task::Lift => "lift",
+            Task::Stack => "stack",
+            Task::Pendulum => "pendulum",
+            Task::Cartpole => "cartpole",
+        }
+    }
+
+    /// The arm's part of the task, for tasks at the table.
+    fn at_table(self) -> Option<&'static dyn TableTask> {
+        match self {
+            Task::Reach => Some(&Reach),
+            Task::Push => Some(&Push),
+            Task::Lift => Some(&Lift),
+            Task::Stack => Some(&Stack),
+            Task::Pendulum | Task::Cartpole => None,
+        }
+    }
+
+    /// A world for the task, with default options.
+    pub fn make(self) -> World {
+        self.make_with(TableOptions::default()).expect("default options suit every task")
+    }
+
+    /// A world for the task.
+    ///
+    /// # Errors
+    /// If `options` ask of a classic what only the arm can do.
+    pub fn make_with(self, options: TableOptions) -> Result<World> {
+        if let Some(task) = self.at_table() {
+            return Ok(World::Tabletop(Box::new(Tabletop::new(task, options))));
+        }
+        if options != TableOptions::default() {
+            return Err(Error::BadSetting(format!("{} has no options; those are for the arm's tasks", self.name())));
+        }
+        Ok(match self {
+            Task::Pendulum => World::Pendulum(Pendulum::default()),
+            _ => World::CartPole(CartPole::default()),
+        })
+    }
+}
+
+impl std::fmt::Display for Task {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl std::str::FromStr for Task {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        let found = Task::ALL.into_iter().find(|task| task.name() == name);
+        found.ok_or_else(|| Error::unknown("task", name, Task::ALL.map(Task::name)))
+    }
+}
+
+/// Any of the worlds of this crate.
+#[allow(clippy::large_enum_variant)] // one of them exists at a time
+pub enum World {
+    /// An arm task.
+    Tabletop(Box<Tabletop>),
+    /// The pendulum.
+    Pendulum(Pendulum),
+    /// The cart-pole.
+    CartPole(CartPole),
+}
+
+/// A state of any of the worlds.
+#[derive(Clone)]
+pub enum WorldState {
+    /// Of an arm task.
+    Tabletop(Box<TabletopState>),
+    /// Of the pendulum.
+    Pendulum(PendulumState),
+    /// Of the cart-pole.
+    CartPole(CartPoleState),
+}
+
+/// The same call on whichever world it is.
+macro_rules! delegate {
+    ($world:expr, $inner:ident => $call:expr) => {
+        match $world {
+            World::Tabletop($inner) => $call,
+            World::Pendulum($inner) => $call,
+            World::CartPole($inner) => $call,
+        }
+    };
+}
+
+impl World {
+    /// The action of the task's hand-written policy, where it has one.
+    pub fn scripted(&self) -> Option<Vec<f32>> {
+        match self {
+            World::Tabletop(tabletop) => Some(tabletop.scripted()),
+            World::Pendulum(_) | World::CartPole(_) => None,
+        }
+    }
+}
+
+impl Env for World {
+    fn spec(&self) -> &Spec {
+        delegate!(self, world => world.spec())
+    }
+
+    fn reset(&mut self, seed: u64) -> Vec<f32> {
+        delegate!(self, world => world.reset(seed))
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step> {
+        delegate!(self, world => world.step(action))
+    }
+
+    fn hand(&self) -> Option<[f64; 3]> {
+        delegate!(self, world => world.hand())
+    }
+
+    fn scene(&self) -> Vec<Body> {
+        delegate!(self, world => world.scene())
+    }
+
+    fn poses(&self) -> Vec<Pose> {
+        delegate!(self, world => world.poses())
+    }
+}
+
+impl KnownReward for World {
+    fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32 {
+        delegate!(self, world => world.reward(obs, action, next_obs))
+    }
+
+    fn terminated(&self, next_obs: &[f32]) -> bool {
+        delegate!(self, world => world.terminated(next_obs))
+    }
+}
+
+impl Snapshot for World {
+    type State = WorldState;
+
+    fn snapshot(&self) -> WorldState {
+        match self {
+            World::Tabletop(world) => WorldState::Tabletop(Box::new(world.snapshot())),
+            World::Pendulum(world) => WorldState::Pendulum(world.snapshot()),
+            World::CartPole(world) => WorldState::CartPole(world.snapshot()),
+        }
+    }
+
+    /// # Panics
+    /// If the state is of another kind of world.
+    fn restore(&mut self, state: &WorldState) {
+        match (self, state) {
+            (World::Tabletop(world), WorldState::Tabletop(state)) => world.restore(state),
+            (World::Pendulum(world), WorldState::Pendulum(state)) => world.restore(state),
+            (World::CartPole(world), WorldState::CartPole(state)) => world.restore(state),
+            _ => panic!("a state can only be restored in the kind of world that it was taken from"),
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! What can go wrong, said so that a person can mend it.
+
+use std::path::{Path, PathBuf};
+
+/// The crate's result.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// An error that says what was wrong, where, and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A name that is not one of the known ones.
+    #[error("unknown {what} `{name}`{}; known: {}", hint(.closest), .known.join(", "))]
+    UnknownName {
+        /// The kind of thing that was named.
+        what: &'static str,
+        /// The name that was given.
+        name: String,
+        /// The known name most like it, if one is near.
+        closest: Option<String>,
+        /// All known names.
+        known: Vec<String>,
+    },
+    /// An action that an environment cannot take.
+    #[error("{task}: {problem}")]
+    BadAction {
+        /// The environment.
+        task: String,
+        /// What is wrong with the action.
+        problem: String,
+    },
+    /// A setting with an unusable value.
+    #[error("{0}")]
+    BadSetting(String),
+    /// A configuration file or preset that cannot be read.
+    #[error("{}: {problem}", .path.display())]
+    BadConfig {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A file of ours that is damaged, or not ours.
+    #[error("{}: {problem}", .path.display())]
+    BadFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it, and what to do.
+        problem: String,
+    },
+    /// The operating system said no.
+    #[error("cannot {doing} {}: {source}", .path.display())]
+    Io {
+        /// What was being done: "read", "write", "create".
+        doing: &'static str,
+        /// To which file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Ctrl-C: the run was saved and can be resumed.
+    #[error("interrupted; the same command resumes it")]
+    Interrupted,
+}
+
+fn hint(closest: &Option<String>) -> String {
+    closest.as_ref().map_or(String::new(), |name| format!(" (did you mean `{name}`?)"))
+}
+
+impl Error {
+    /// An unknown name, with the closest of the `known` ones.
+    pub fn unknown<'a>(what: &'static str, name: &str, known: impl IntoIterator<Item = &'a str>) -> Self {
+        let known: Vec<String> = known.into_iter().map(String::from).collect();
+        Self::UnknownName { what, name: name.into(), closest: closest(name, &known), known }
+    }
+
+    /// An action that does not fit.
+    pub fn bad_action(task: &str, problem: impl Into<String>) -> Self {
+        Self::BadAction { task: task.into(), problem: problem.into() }
+    }
+
+    /// A damaged or foreign file.
+    pub fn bad_file(path: &Path, problem: impl std::fmt::Display) -> Self {
+        Self::BadFile { path: path.into(), problem: problem.to_string() }
+    }
+
+    /// For `map_err`: a failed read, write or the like of `path`.
+    pub fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_path_buf();
+        move |source| Self::Io { doing, path, source }
+    }
+}
+
+/// The known name most like `name`, if it is near enough to be a slip.
+fn closest(name: &str, known: &[String]) -> Option<String> {
+    known
+        .iter()
+        .map(|candidate| (strsim::damerau_levenshtein(&name.to_lowercase(), candidate), candidate))
+        .min()
+        .filter(|(distance, candidate)| *distance <= candidate.len().max(name.len()) / 2)
+        .map(|(_, candidate)| candidate.clone())
+}

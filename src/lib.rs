@@ -1,0 +1,3 @@
+pub mod env;
+pub mod error;
+pub mod rng;

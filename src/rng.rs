@@ -1,0 +1,26 @@
+//! Random numbers: always from a generator that was passed in, never from a global one.
+
+use rand::{RngExt, SeedableRng};
+
+/// The generator used everywhere: fast, small, and its state can be saved.
+pub type Rng = rand_xoshiro::Xoshiro256PlusPlus;
+
+/// The generator for `purpose` in a run with this `seed`. Different purposes give independent
+/// streams, so that drawing more numbers for one never changes another.
+pub fn stream(seed: u64, purpose: &str) -> Rng {
+    // FNV-1a: a hash that will be the same in every version of this crate.
+    let hash = purpose.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+    });
+    Rng::seed_from_u64(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ hash)
+}
+
+/// A number drawn uniformly from `low..high`.
+pub fn uniform(rng: &mut Rng, low: f64, high: f64) -> f64 {
+    low + (high - low) * rng.random::<f64>()
+}
+
+/// A number drawn from the standard normal distribution.
+pub fn normal(rng: &mut Rng) -> f64 {
+    rng.sample(rand_distr::StandardNormal)
+}
