@@ -1,3 +1,9 @@
+pub mod agent;
 pub mod env;
 pub mod error;
+pub mod files;
+pub mod nn;
+pub mod replay;
 pub mod rng;
+pub mod study;
+pub mod watch;

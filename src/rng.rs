@@ -24,3 +24,14 @@ pub fn uniform(rng: &mut Rng, low: f64, high: f64) -> f64 {
 pub fn normal(rng: &mut Rng) -> f64 {
     rng.sample(rand_distr::StandardNormal)
 }
+
+/// The generator's state, to be saved.
+pub fn state(rng: &Rng) -> [u64; 4] {
+    let json = serde_json::to_value(rng).expect("a generator serialises");
+    serde_json::from_value(json["s"].clone()).expect("four words of state")
+}
+
+/// A generator that goes on from a saved state.
+pub fn from_state(state: &[u64]) -> Rng {
+    serde_json::from_value(serde_json::json!({ "s": state })).expect("four words of state")
+}

@@ -6,7 +6,7 @@ use super::arm::Pose;
 use super::cartpole::{CartPole, CartPoleState};
 use super::pendulum::{Pendulum, PendulumState};
 use super::scene::Body;
-use super::tabletop::{Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
+use super::tabletop::{ActionKind, Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
 use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::{Error, Result};
 
@@ -54,6 +54,18 @@ impl Task {
             Task::Stack => Some(&Stack),
             Task::Pendulum | Task::Cartpole => None,
         }
+    }
+
+    /// The hand-written policy of an arm task: from a compact observation to an action.
+    pub fn scripted_policy(self, options: TableOptions) -> Option<impl Fn(&[f32]) -> Vec<f32> + Send + use<>> {
+        let task = self.at_table()?;
+        Some(move |obs: &[f32]| {
+            let [x, y, z, grip] = task.scripted(obs).map(|a| a.clamp(-1.0, 1.0) as f32);
+            match options.action {
+                ActionKind::Hand => vec![x, y, z, grip],
+                ActionKind::Pose => vec![x, y, z, 0.0, 0.0, 0.0, grip],
+            }
+        })
     }
 
     /// A world for the task, with default options.
@@ -125,16 +137,6 @@ macro_rules! delegate {
             World::CartPole($inner) => $call,
         }
     };
-}
-
-impl World {
-    /// The action of the task's hand-written policy, where it has one.
-    pub fn scripted(&self) -> Option<Vec<f32>> {
-        match self {
-            World::Tabletop(tabletop) => Some(tabletop.scripted()),
-            World::Pendulum(_) | World::CartPole(_) => None,
-        }
-    }
 }
 
 impl Env for World {

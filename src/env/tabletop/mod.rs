@@ -230,15 +230,6 @@ impl Tabletop {
         tabletop
     }
 
-    /// What the task's hand-written policy does now.
-    pub fn scripted(&self) -> Vec<f32> {
-        let hand = self.task.scripted(&self.state.compact).map(|a| a.clamp(-1.0, 1.0) as f32);
-        match self.options.action {
-            ActionKind::Hand => hand.to_vec(),
-            ActionKind::Pose => vec![hand[0], hand[1], hand[2], 0.0, 0.0, 0.0, hand[3]],
-        }
-    }
-
     /// The world under the task.
     pub fn physics(&self) -> &Physics {
         &self.state.physics

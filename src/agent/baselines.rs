@@ -1,0 +1,86 @@
+//! Agents that do not learn: the floor, and what a person would write.
+
+use super::{Agent, Losses, Mode};
+use crate::env::tabletop::{ObservationKind, TableOptions};
+use crate::env::{Spec, Task};
+use crate::error::{Error, Result};
+use crate::nn::Weights;
+use crate::replay::Transition;
+use crate::rng::{self, Rng};
+
+/// Uniform random actions.
+pub struct Random {
+    actions: usize,
+    rng: Rng,
+}
+
+impl Random {
+    /// Random actions for an environment.
+    pub fn new(spec: &Spec, seed: u64) -> Self {
+        Self { actions: spec.action_size, rng: rng::stream(seed, "random agent") }
+    }
+}
+
+/// The hand-written policy of one of the arm's tasks.
+pub struct Scripted {
+    policy: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
+}
+
+impl Scripted {
+    /// The policy of `task`.
+    ///
+    /// # Errors
+    /// If the task has none, or observations are not compact.
+    pub fn new(task: Task, options: TableOptions) -> Result<Self> {
+        if options.observation != ObservationKind::Compact {
+            return Err(Error::BadSetting("the scripted policies read compact observations".into()));
+        }
+        let policy = task
+            .scripted_policy(options)
+            .ok_or_else(|| Error::BadSetting(format!("{task} has no scripted policy; the arm's tasks do")))?;
+        Ok(Self { policy: Box::new(policy) })
+    }
+}
+
+/// What there is to say of an agent that never learns.
+macro_rules! never_learns {
+    () => {
+        fn observe(&mut self, _transition: &Transition) {}
+
+        fn update(&mut self) -> Option<Losses> {
+            None
+        }
+
+        fn weights(&self) -> Weights {
+            Weights::default()
+        }
+
+        fn load_weights(&mut self, _weights: &Weights) -> Result<()> {
+            Ok(())
+        }
+
+        fn training_state(&self) -> Weights {
+            Weights::default()
+        }
+
+        fn load_training_state(&mut self, _state: &Weights) -> Result<()> {
+            Ok(())
+        }
+    };
+}
+
+impl Agent for Random {
+    fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
+        (0..self.actions).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect()
+    }
+
+    never_learns!();
+}
+
+impl Agent for Scripted {
+    fn act(&mut self, obs: &[f32], _mode: Mode) -> Vec<f32> {
+        (self.policy)(obs)
+    }
+
+    never_learns!();
+}

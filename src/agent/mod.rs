@@ -1,0 +1,62 @@
+//! Agents: wiring of models, planners and networks behind one small interface.
+
+mod baselines;
+mod sac;
+
+pub use baselines::{Random, Scripted};
+pub use sac::{Sac, SacConfig};
+
+use std::collections::BTreeMap;
+
+use crate::error::Result;
+use crate::nn::Weights;
+use crate::replay::Transition;
+
+/// Why an agent is asked to act.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// To learn: it may explore.
+    Explore,
+    /// To be judged: it does its best, deterministically.
+    Evaluate,
+}
+
+/// Named numbers that an update reports: losses, entropies, norms.
+pub type Losses = BTreeMap<&'static str, f32>;
+
+/// Something that acts and learns.
+pub trait Agent: Send {
+    /// Chooses an action, each number in [-1, 1].
+    fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32>;
+
+    /// Actions for many observations at once, in [`Mode::Evaluate`]. Networks answer for all of them
+    /// in one pass.
+    fn act_batch(&mut self, observations: &[&[f32]]) -> Vec<Vec<f32>> {
+        observations.iter().map(|obs| self.act(obs, Mode::Evaluate)).collect()
+    }
+
+    /// Takes in one step of experience.
+    fn observe(&mut self, transition: &Transition);
+
+    /// Learns from what was observed; called once after every step. `None` while it only collects.
+    fn update(&mut self) -> Option<Losses>;
+
+    /// What the agent has learned, enough to act.
+    fn weights(&self) -> Weights;
+
+    /// Takes over learned weights.
+    ///
+    /// # Errors
+    /// If they are not those of an agent of this kind and these sizes.
+    fn load_weights(&mut self, weights: &Weights) -> Result<()>;
+
+    /// Everything else that training needs to go on as if it had never stopped: optimisers,
+    /// experience, random numbers.
+    fn training_state(&self) -> Weights;
+
+    /// Takes over what [`Agent::training_state`] has given.
+    ///
+    /// # Errors
+    /// If it is not that of an agent of this kind and these sizes.
+    fn load_training_state(&mut self, state: &Weights) -> Result<()>;
+}

@@ -1,0 +1,36 @@
+//! The learning core on dfdx: layers with runtime shapes, Adam, a squashed Gaussian, weights in and
+//! out.
+//!
+//! Everything is built for several networks at once: a tensor is `[members, batch, features]`. A
+//! single network has one member, twin critics have two, an ensemble as many as it likes, and all
+//! run through the same code.
+
+mod adam;
+mod gaussian;
+pub mod kernels;
+mod layers;
+pub mod ops;
+mod weights;
+
+pub use adam::{Adam, AdamConfig};
+pub use dfdx;
+pub use gaussian::SquashedGaussian;
+pub use kernels::Activation;
+pub use layers::{Mlp, MlpConfig, Parameters, copy_parameters, polyak};
+pub use ops::{Learning, Tensor3, values};
+pub use weights::Weights;
+
+use dfdx::tensor::{Cache, Cpu, TensorFrom};
+
+/// The device that tensors live on. Its allocation cache is off: buffers made here would only ever
+/// enter it.
+pub fn device() -> Cpu {
+    let cpu = Cpu::default();
+    cpu.disable_cache();
+    cpu
+}
+
+/// A tensor `[members, batch, features]` of the given numbers.
+pub fn tensor(cpu: &Cpu, values: Vec<f32>, shape: (usize, usize, usize)) -> Tensor3 {
+    cpu.tensor((values, shape))
+}

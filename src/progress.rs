@@ -1,0 +1,118 @@
+//! Progress on the terminal: a bar for each run that is under way; where there is no terminal, a line for each
+//! evaluation.
+
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::time::Duration;
+
+use handful::study::config::RunConfig;
+use handful::study::plan::Observer;
+use handful::study::run::Event;
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+
+/// Shows how the runs of a study go.
+pub struct Progress {
+    bars: MultiProgress,
+    runs: Vec<Mutex<Shown>>,
+    on_terminal: bool,
+}
+
+/// What is shown of a run.
+struct Shown {
+    name: String,
+    bar: Option<ProgressBar>,
+    last_return: Option<f64>,
+    success: Option<f64>,
+}
+
+impl Progress {
+    /// For these runs.
+    pub fn new(runs: &[(RunConfig, PathBuf)]) -> Self {
+        let shown = |config: &RunConfig| Shown {
+            name: format!("{} {} seed {}", config.task, config.method, config.seed),
+            bar: None,
+            last_return: None,
+            success: None,
+        };
+        Self {
+            bars: MultiProgress::new(),
+            runs: runs.iter().map(|(config, _)| Mutex::new(shown(config))).collect(),
+            on_terminal: console::user_attended_stderr(),
+        }
+    }
+
+    /// Takes the bars away.
+    pub fn finish(&self) {
+        let _ = self.bars.clear();
+    }
+}
+
+impl Shown {
+    fn message(&self) -> String {
+        let show = |value: Option<f64>, name: &str, digits: usize| {
+            value.map_or(String::new(), |v| format!("{name} {v:.digits$}  "))
+        };
+        let success = self.success.map_or(String::new(), |s| format!("success {:.0} %", 100.0 * s));
+        show(self.last_return, "return", 1) + &success
+    }
+}
+
+impl Observer for Progress {
+    fn started(&self, run: usize, config: &RunConfig, done: usize) {
+        let mut shown = self.runs[run].lock().expect("no panic holds it");
+        let steps = if config.learns() { config.steps as u64 } else { 0 };
+        let template = "{prefix:24} [{bar:24}] {pos}/{len} steps  {per_sec:.0}/s  {eta} left  {msg}";
+        let style = ProgressStyle::with_template(template).expect("our template").progress_chars("=> ");
+        let style = style.with_key("per_sec", |state: &indicatif::ProgressState, out: &mut dyn std::fmt::Write| {
+            let _ = write!(out, "{:.0}", state.per_sec());
+        });
+        let style = style.template("{prefix:24} [{bar:24}] {pos}/{len} steps  {per_sec}/s  {eta} left  {msg}");
+        let bar = self.bars.add(ProgressBar::new(steps)).with_style(style.expect("our template"));
+        bar.set_prefix(shown.name.clone());
+        bar.set_position(done as u64);
+        bar.reset_eta();
+        bar.enable_steady_tick(Duration::from_millis(250));
+        if !self.on_terminal {
+            let resumed = if done > 0 { format!(", going on after {done} steps") } else { String::new() };
+            eprintln!("{}: started{resumed}", shown.name);
+        }
+        shown.bar = Some(bar);
+    }
+
+    fn happened(&self, run: usize, config: &RunConfig, done: usize, event: &Event) {
+        let mut shown = self.runs[run].lock().expect("no panic holds it");
+        let name = shown.name.clone();
+        let line = match event {
+            Event::Stepped => None,
+            Event::EpisodeEnded(row) => {
+                shown.last_return = Some(row.total);
+                None
+            }
+            Event::Evaluated(row) => {
+                shown.success = Some(row.success);
+                let (percent, total) = (100.0 * row.success, row.return_mean);
+                Some(format!("{name}: {done}/{} steps, return {total:.1}, success {percent:.0} %", config.steps))
+            }
+            Event::Tested(test) => {
+                let summary = test.summary();
+                let percent = 100.0 * summary.success;
+                Some(format!("{name}: tested in {} episodes, success {percent:.0} %", summary.episodes))
+            }
+        };
+        if let Some(bar) = &shown.bar {
+            bar.set_position(done as u64);
+            if !matches!(event, Event::Stepped) {
+                bar.set_message(shown.message());
+            }
+            if let Event::Tested(_) = event {
+                bar.finish_and_clear();
+                if self.on_terminal {
+                    let _ = self.bars.println(line.clone().unwrap_or_default());
+                }
+            }
+        }
+        if let (false, Some(line)) = (self.on_terminal, line) {
+            eprintln!("{line}");
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! The protocol by which every agent is judged: the same starts for all, deterministic actions.
+
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use super::smoothness;
+use super::statistics::{deviation, mean, wilson};
+use crate::agent::Agent;
+use crate::env::vector::VectorEnv;
+use crate::env::{Env, World};
+use crate::error::{Error, Result};
+
+/// Worlds that are stepped side by side; agents answer for all of them in one pass.
+const WORLDS: usize = 20;
+
+/// Which starts an evaluation has. No training episode shares them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Starts {
+    /// Those of the evaluations during training.
+    Training,
+    /// Those of the test at the end: never seen before.
+    Test,
+    /// Those that follow from a seed of the user's.
+    Seed(u64),
+}
+
+impl Starts {
+    fn seed(self, episode: usize) -> u64 {
+        let base = match self {
+            Starts::Training => 1 << 40,
+            Starts::Test => 2 << 40,
+            Starts::Seed(seed) => (3 << 40) + (seed << 20),
+        };
+        base + episode as u64
+    }
+}
+
+/// One judged episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Episode {
+    /// Sum of rewards.
+    #[serde(rename = "return")]
+    pub total: f64,
+    /// Whether the task was fulfilled at the last step.
+    pub success: bool,
+    /// Steps.
+    pub length: usize,
+    /// The highest stage that was fulfilled at any step.
+    pub stage: usize,
+    /// Spectral arc length of the hand's speed, if there is a hand and it moved.
+    pub sparc: Option<f64>,
+    /// Log dimensionless jerk of the hand.
+    pub ldlj: Option<f64>,
+}
+
+/// What an evaluation found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Evaluation {
+    /// The episodes, in the order of their starts.
+    pub episodes: Vec<Episode>,
+    /// Time to choose one action, ms, when asked for one at a time.
+    pub action_ms: f64,
+}
+
+/// The numbers of an [`Evaluation`], as they stand in tables.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Episodes.
+    pub episodes: usize,
+    /// Success rate.
+    pub success: f64,
+    /// Wilson interval of the success rate, 95 %.
+    pub success_low: f64,
+    /// Its upper end.
+    pub success_high: f64,
+    /// Mean return.
+    pub return_mean: f64,
+    /// Standard deviation of the return.
+    pub return_std: f64,
+    /// Mean spectral arc length of the hand's speed.
+    pub smoothness_sparc: Option<f64>,
+    /// Mean log dimensionless jerk of the hand.
+    pub smoothness_ldlj: Option<f64>,
+    /// Milliseconds to choose an action.
+    pub action_ms: f64,
+}
+
+impl Evaluation {
+    /// The evaluation in numbers.
+    pub fn summary(&self) -> Summary {
+        let successes = self.episodes.iter().filter(|episode| episode.success).count();
+        let [success_low, success_high] = wilson(successes, self.episodes.len());
+        let returns: Vec<f64> = self.episodes.iter().map(|episode| episode.total).collect();
+        let mean_of = |values: Vec<f64>| (!values.is_empty()).then(|| mean(&values));
+        Summary {
+            episodes: self.episodes.len(),
+            success: successes as f64 / self.episodes.len() as f64,
+            success_low,
+            success_high,
+            return_mean: mean(&returns),
+            return_std: deviation(&returns),
+            smoothness_sparc: mean_of(self.episodes.iter().filter_map(|episode| episode.sparc).collect()),
+            smoothness_ldlj: mean_of(self.episodes.iter().filter_map(|episode| episode.ldlj).collect()),
+            action_ms: self.action_ms,
+        }
+    }
+}
+
+/// Worlds of one kind, kept for many evaluations.
+pub struct Judge {
+    worlds: VectorEnv<World>,
+}
+
+impl Judge {
+    /// A judge with worlds made by `make`.
+    ///
+    /// # Errors
+    /// What `make` answers.
+    pub fn new(make: impl Fn() -> Result<World> + Sync) -> Result<Self> {
+        make()?;
+        Ok(Self { worlds: VectorEnv::new(WORLDS, || make().expect("what was made once can be made again")) })
+    }
+
+    /// Lets the agent act in `episodes` episodes from the given starts.
+    ///
+    /// # Errors
+    /// If there are no episodes, or the agent's actions cannot be taken.
+    pub fn evaluate(&mut self, agent: &mut dyn Agent, episodes: usize, starts: Starts) -> Result<Evaluation> {
+        if episodes == 0 {
+            return Err(Error::BadSetting("an evaluation needs at least one episode".into()));
+        }
+        let mut judged = Vec::with_capacity(episodes);
+        let mut action_ms = 0.0;
+        for first in (0..episodes).step_by(WORLDS) {
+            let seeds: Vec<u64> = (first..episodes.min(first + WORLDS)).map(|i| starts.seed(i)).collect();
+            judged.extend(self.side_by_side(agent, &seeds, &mut action_ms)?);
+        }
+        Ok(Evaluation { episodes: judged, action_ms })
+    }
+
+    fn side_by_side(&mut self, agent: &mut dyn Agent, seeds: &[u64], action_ms: &mut f64) -> Result<Vec<Episode>> {
+        let dt = self.worlds.envs()[0].spec().dt;
+        let mut observations = self.worlds.reset(seeds);
+        let mut paths: Vec<Vec<[f64; 3]>> =
+            self.worlds.envs().iter().take(seeds.len()).map(|world| world.hand().into_iter().collect()).collect();
+        let blank = Episode { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
+        let mut episodes = vec![blank; seeds.len()];
+        let mut running: Vec<usize> = (0..seeds.len()).collect();
+        *action_ms = time_of_action(agent, &observations[0]);
+        while !running.is_empty() {
+            let seen: Vec<&[f32]> = running.iter().map(|&i| observations[i].as_slice()).collect();
+            let mut actions = vec![None; seeds.len()];
+            for (&i, action) in running.iter().zip(agent.act_batch(&seen)) {
+                actions[i] = Some(action);
+            }
+            for (i, step) in self.worlds.step(&actions)?.into_iter().enumerate() {
+                let Some(step) = step else { continue };
+                let episode = &mut episodes[i];
+                episode.total += f64::from(step.reward);
+                episode.success = step.success;
+                episode.length += 1;
+                episode.stage = episode.stage.max(step.stage);
+                paths[i].extend(self.worlds.envs()[i].hand());
+                if step.done() {
+                    running.retain(|&other| other != i);
+                }
+                observations[i] = step.observation;
+            }
+        }
+        for (episode, path) in episodes.iter_mut().zip(&paths) {
+            if let Some((sparc, ldlj)) = smoothness::of_path(path, dt) {
+                (episode.sparc, episode.ldlj) = (Some(sparc), Some(ldlj));
+            }
+        }
+        Ok(episodes)
+    }
+}
+
+/// Milliseconds that one action takes: the median of a few.
+fn time_of_action(agent: &mut dyn Agent, obs: &[f32]) -> f64 {
+    let mut times: Vec<f64> = (0..5)
+        .map(|_| {
+            let start = Instant::now();
+            std::hint::black_box(agent.act_batch(&[obs]));
+            start.elapsed().as_secs_f64() * 1e3
+        })
+        .collect();
+    times.sort_by(f64::total_cmp);
+    times[2]
+}

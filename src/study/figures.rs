@@ -1,0 +1,188 @@
+//! The figures of a study, as SVG, from its tables alone.
+
+use std::path::Path;
+
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+use super::tables::Tables;
+use crate::error::{Error, Result};
+use crate::files;
+
+/// Colours that stay apart for colour-blind readers (Okabe and Ito).
+const PALETTE: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+];
+const FONT: &str = "sans-serif";
+const GREY: RGBColor = RGBColor(110, 110, 110);
+const SIZE: (u32, u32) = (820, 440);
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
+
+/// Success over environment steps for one task: a line for the mean of each learning method, its band from the
+/// worst seed to the best, and a dashed line for each method that does not learn.
+///
+/// # Errors
+/// If the tables lack a column or the file cannot be written.
+pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
+    let mut learning = Vec::new();
+    let mut fixed = Vec::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        let curves = tables.curves(task, &method)?;
+        if curves.is_empty() {
+            fixed.push((tables.value(task, &method, "success")?.unwrap_or(0.0), method));
+        } else {
+            learning.push((method, curves));
+        }
+    }
+    let budget = learning.iter().flat_map(|(_, curves)| curves).filter_map(|(x, _)| x.last().copied());
+    let budget = budget.fold(1.0, f64::max);
+    draw(path, |area| {
+        let mut chart = ChartBuilder::on(&area)
+            .caption(format!("{task}: success over environment steps"), (FONT, 20))
+            .margin(14)
+            .x_label_area_size(44)
+            .y_label_area_size(58)
+            .build_cartesian_2d(0.0..budget, -0.02..1.04)?;
+        chart
+            .configure_mesh()
+            .light_line_style(WHITE)
+            .bold_line_style(GREY.mix(0.2))
+            .axis_style(GREY)
+            .x_desc("environment steps, random warm-up included")
+            .y_desc("success rate")
+            .y_labels(6)
+            .x_label_formatter(&|x| thousands(*x))
+            .y_label_formatter(&|y| format!("{:.0} %", 100.0 * y))
+            .label_style((FONT, 14))
+            .draw()?;
+        let mut palette = PALETTE.iter().cycle();
+        for (method, curves) in &learning {
+            let color = *palette.next().expect("an endless palette");
+            let (steps, band) = band(curves);
+            let outline = steps.iter().zip(&band).map(|(x, [low, _, _])| (*x, *low));
+            let back = steps.iter().zip(&band).rev().map(|(x, [_, _, high])| (*x, *high));
+            let polygon: Vec<(f64, f64)> = outline.chain(back).collect();
+            if curves.len() > 1 {
+                chart.draw_series([Polygon::new(polygon, color.mix(0.18))])?;
+            }
+            let mean = steps.iter().zip(&band).map(|(x, [_, mean, _])| (*x, *mean));
+            let label = format!("{method} ({} seed{})", curves.len(), if curves.len() == 1 { "" } else { "s" });
+            chart
+                .draw_series(LineSeries::new(mean, color.stroke_width(3)))?
+                .label(label)
+                .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(3)));
+        }
+        for (success, method) in &fixed {
+            let color = *palette.next().expect("an endless palette");
+            let ends = [(0.0, *success), (budget, *success)];
+            chart
+                .draw_series(DashedLineSeries::new(ends, 7, 5, color.stroke_width(2)))?
+                .label(format!("{method} (does not learn)"))
+                .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(2)));
+        }
+        chart
+            .configure_series_labels()
+            .position(SeriesLabelPosition::LowerRight)
+            .background_style(WHITE.mix(0.85))
+            .border_style(GREY.mix(0.4))
+            .label_font((FONT, 14))
+            .margin(8)
+            .draw()?;
+        Ok(())
+    })
+}
+
+/// The test of every method on one task: success with its 95 % interval, and smoothness of the hand.
+///
+/// # Errors
+/// If the tables lack a column or the file cannot be written.
+pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
+    let mut rows = Vec::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        let value = |column: &str| tables.value(task, &method, column);
+        let success = [value("success_low")?, value("success")?, value("success_high")?].map(|v| v.unwrap_or(0.0));
+        let sparc = value("smoothness_sparc")?;
+        rows.push((method, success, sparc));
+    }
+    let roughest = rows.iter().filter_map(|(_, _, sparc)| *sparc).fold(-2.0, f64::min);
+    let count = rows.len();
+    draw(path, |area| {
+        area.titled(&format!("{task}: the test at the end"), (FONT, 20))?;
+        let area = area.margin(40, 10, 10, 10);
+        let (left, right) = area.split_horizontally(470);
+        let panel = |area: &Area, title: &str, left_margin: u32, from: f64, to: f64, percent: bool| -> Drawn {
+            let names: Vec<String> = rows.iter().map(|(method, ..)| method.clone()).collect();
+            let mut chart = ChartBuilder::on(area)
+                .caption(title, (FONT, 15))
+                .margin(8)
+                .x_label_area_size(34)
+                .y_label_area_size(left_margin)
+                .build_cartesian_2d(from..to, -0.6..count as f64 - 0.4)?;
+            chart
+                .configure_mesh()
+                .disable_y_mesh()
+                .disable_y_axis()
+                .light_line_style(WHITE)
+                .bold_line_style(GREY.mix(0.2))
+                .axis_style(GREY)
+                .x_labels(6)
+                .x_label_formatter(&|x| if percent { format!("{:.0} %", 100.0 * x) } else { format!("{x:.1}") })
+                .label_style((FONT, 14))
+                .draw()?;
+            for (i, (_, [low, mid, high], sparc)) in rows.iter().enumerate() {
+                let color = PALETTE[i % PALETTE.len()];
+                let y = (count - 1 - i) as f64;
+                if percent {
+                    chart.draw_series([PathElement::new([(*low, y), (*high, y)], color.stroke_width(3))])?;
+                    chart.draw_series([Circle::new((*mid, y), 6, color.filled())])?;
+                } else if let Some(sparc) = sparc {
+                    chart.draw_series([Circle::new((*sparc, y), 6, color.filled())])?;
+                }
+                if left_margin > 0 {
+                    let at = chart.backend_coord(&(from, y));
+                    let style = (FONT, 15).into_font().color(&BLACK);
+                    let (width, _) = area.estimate_text_size(&names[i], &style)?;
+                    let corner = area.get_base_pixel();
+                    let place = (at.0 - corner.0 - width as i32 - 10, at.1 - corner.1 - 8);
+                    area.draw_text(&names[i], &style, place)?;
+                }
+            }
+            Ok(())
+        };
+        panel(&left, "success, 95 % interval", 110, 0.0, 1.03, true)?;
+        panel(&right, "smoothness (SPARC; a perfect movement has -1.4)", 0, roughest * 1.1, -1.0, false)
+    })
+}
+
+/// Steps common to all seeds, with the lowest, mean and highest value at each.
+fn band(curves: &[(Vec<f64>, Vec<f64>)]) -> (Vec<f64>, Vec<[f64; 3]>) {
+    let shortest = curves.iter().min_by_key(|(x, _)| x.len()).expect("at least one curve");
+    let rows = (0..shortest.0.len()).map(|i| {
+        let values: Vec<f64> = curves.iter().map(|(_, y)| y[i]).collect();
+        let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+        let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        [low, values.iter().sum::<f64>() / values.len() as f64, high]
+    });
+    (shortest.0.clone(), rows.collect())
+}
+
+/// 12500 as "12.5k".
+fn thousands(x: f64) -> String {
+    if x >= 1000.0 { format!("{}k", (x / 100.0).round() / 10.0) } else { format!("{x:.0}") }
+}
+
+fn draw(path: &Path, paint: impl FnOnce(Area) -> Drawn) -> Result<()> {
+    let mut svg = String::new();
+    let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
+    let painted = area.fill(&WHITE).map_err(Into::into).and_then(|()| paint(area));
+    painted.map_err(|problem| Error::bad_file(path, format!("cannot be drawn: {problem}")))?;
+    files::write(path, svg.as_bytes())
+}

@@ -1,0 +1,379 @@
+//! One run: an agent learns a task, is evaluated on the way and tested at the end; all of it in a
+//! folder that survives crashes and can be resumed.
+//!
+//! The folder holds `config.toml`, `episodes.csv`, `evaluations.csv`, `losses.csv`, `weights.safetensors`,
+//! at the end `test.csv`, and `checkpoint/state.safetensors`, the one file that a resumed run starts
+//! from. Every file is written under a temporary name and renamed.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use super::config::RunConfig;
+use super::evaluate::{Evaluation, Judge, Starts, Summary};
+use crate::agent::{Agent, Mode};
+use crate::env::{Env, World};
+use crate::error::{Error, Result};
+use crate::files;
+use crate::nn::Weights;
+use crate::replay::Transition;
+
+/// A checkpoint is due after this long.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(30);
+/// Losses are averaged over this many steps for `losses.csv`.
+const LOSSES_EVERY: usize = 500;
+
+/// A row of `episodes.csv`: one training episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeRow {
+    /// Environment steps at its end.
+    pub step: usize,
+    /// Its number, from 1.
+    pub episode: usize,
+    /// Sum of rewards.
+    #[serde(rename = "return")]
+    pub total: f64,
+    /// Whether the task was fulfilled at its last step.
+    pub success: bool,
+    /// Steps in it.
+    pub length: usize,
+    /// Seconds of training at its end.
+    pub seconds: f64,
+}
+
+/// A row of `evaluations.csv`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EvaluationRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// Episodes judged.
+    pub episodes: usize,
+    /// Success rate.
+    pub success: f64,
+    /// Mean return.
+    pub return_mean: f64,
+    /// Standard deviation of the return.
+    pub return_std: f64,
+    /// Mean spectral arc length of the hand's speed.
+    pub smoothness_sparc: Option<f64>,
+    /// Mean log dimensionless jerk of the hand.
+    pub smoothness_ldlj: Option<f64>,
+    /// Milliseconds to choose an action.
+    pub action_ms: f64,
+}
+
+impl EvaluationRow {
+    fn new(step: usize, summary: Summary) -> Self {
+        let Summary {
+            episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms, ..
+        } = summary;
+        Self { step, episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms }
+    }
+}
+
+/// A row of `losses.csv`: the mean of one loss over the last steps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LossRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// What it is.
+    pub name: String,
+    /// Its mean.
+    pub value: f32,
+}
+
+/// What a run has seen so far; the CSV files are this.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+struct Progress {
+    step: usize,
+    seconds: f64,
+    episodes: Vec<EpisodeRow>,
+    evaluations: Vec<EvaluationRow>,
+    losses: Vec<LossRow>,
+}
+
+/// What happened in a [`Run::step`].
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// Nothing worth a line.
+    Stepped,
+    /// A training episode ended.
+    EpisodeEnded(EpisodeRow),
+    /// An evaluation during training.
+    Evaluated(EvaluationRow),
+    /// The test at the end; the run is complete.
+    Tested(Evaluation),
+}
+
+/// A run in progress. Whoever holds it decides when to step, to save, and to stop.
+pub struct Run {
+    config: RunConfig,
+    folder: PathBuf,
+    world: World,
+    judge: Judge,
+    agent: Box<dyn Agent>,
+    progress: Progress,
+    obs: Vec<f32>,
+    episode_return: f64,
+    episode_length: usize,
+    losses: Vec<(&'static str, f32, usize)>,
+    evaluated_at: Option<usize>,
+    clock: Instant,
+    last_save: Instant,
+}
+
+impl Run {
+    /// Starts a run in `folder`, or goes on with the one that is there.
+    ///
+    /// # Errors
+    /// If the folder holds a run with other settings, a damaged checkpoint, or cannot be written.
+    pub fn open(config: RunConfig, folder: &Path) -> Result<Self> {
+        let config_path = folder.join("config.toml");
+        if config_path.exists() {
+            let there = RunConfig::read(&config_path)?;
+            if let Some(difference) = difference(&there, &config) {
+                return Err(Error::bad_file(
+                    &config_path,
+                    format!("this folder holds another run ({difference}); choose another --out, or remove it"),
+                ));
+            }
+        } else {
+            let text = toml::to_string(&config).expect("a configuration is TOML");
+            files::write(&config_path, text.as_bytes())?;
+        }
+        let mut agent = config.agent()?;
+        let checkpoint = folder.join("checkpoint").join("state.safetensors");
+        let progress = if checkpoint.exists() {
+            load(&checkpoint, agent.as_mut())?
+        } else {
+            Progress::default()
+        };
+        let make = || config.world();
+        let mut run = Self {
+            world: config.world()?,
+            judge: Judge::new(make)?,
+            agent,
+            obs: Vec::new(),
+            episode_return: 0.0,
+            episode_length: 0,
+            losses: Vec::new(),
+            evaluated_at: progress.evaluations.last().map(|row| row.step),
+            progress,
+            folder: folder.into(),
+            clock: Instant::now(),
+            last_save: Instant::now(),
+            config,
+        };
+        run.start_episode();
+        Ok(run)
+    }
+
+    /// The run's settings.
+    pub fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
+    /// Environment steps so far.
+    pub fn steps_done(&self) -> usize {
+        self.progress.step
+    }
+
+    /// Whether the run is at the start of an episode, where it can be saved.
+    pub fn between_episodes(&self) -> bool {
+        self.episode_length == 0
+    }
+
+    /// Acts and learns for one step; at the end of the budget, runs the test. Saves when it is time.
+    ///
+    /// # Errors
+    /// If an action cannot be taken or a file cannot be written.
+    pub fn step(&mut self) -> Result<Event> {
+        let step = self.progress.step;
+        let budget = if self.config.learns() { self.config.steps } else { 0 };
+        if self.config.learns()
+            && (step.is_multiple_of(self.config.evaluate_every) || step == budget)
+            && self.evaluated_at != Some(step)
+        {
+            return self.evaluate();
+        }
+        if step >= budget {
+            return self.test();
+        }
+        let action = self.agent.act(&self.obs, Mode::Explore);
+        let outcome = self.world.step(&action)?;
+        self.agent.observe(&Transition {
+            obs: std::mem::take(&mut self.obs),
+            action,
+            reward: outcome.reward,
+            next_obs: outcome.observation.clone(),
+            terminated: outcome.terminated,
+            truncated: outcome.truncated,
+        });
+        self.obs.clone_from(&outcome.observation);
+        self.progress.step += 1;
+        self.episode_return += f64::from(outcome.reward);
+        self.episode_length += 1;
+        if let Some(losses) = self.agent.update() {
+            self.note(losses);
+        }
+        if !outcome.done() {
+            return Ok(Event::Stepped);
+        }
+        let row = EpisodeRow {
+            step: self.progress.step,
+            episode: self.progress.episodes.len() + 1,
+            total: self.episode_return,
+            success: outcome.success,
+            length: self.episode_length,
+            seconds: self.seconds(),
+        };
+        self.progress.episodes.push(row.clone());
+        self.start_episode();
+        if self.last_save.elapsed() > CHECKPOINT_EVERY {
+            self.save()?;
+        }
+        Ok(Event::EpisodeEnded(row))
+    }
+
+    fn start_episode(&mut self) {
+        // Seeds of different runs lie 2^20 episodes apart.
+        let seed = (self.config.seed << 20) + self.progress.episodes.len() as u64;
+        self.obs = self.world.reset(seed);
+        (self.episode_return, self.episode_length) = (0.0, 0);
+    }
+
+    fn seconds(&self) -> f64 {
+        self.progress.seconds + self.clock.elapsed().as_secs_f64()
+    }
+
+    fn note(&mut self, losses: crate::agent::Losses) {
+        for (name, value) in losses {
+            match self.losses.iter_mut().find(|(known, ..)| *known == name) {
+                Some((_, sum, count)) => (*sum, *count) = (*sum + value, *count + 1),
+                None => self.losses.push((name, value, 1)),
+            }
+        }
+        if self.progress.step.is_multiple_of(LOSSES_EVERY) {
+            let step = self.progress.step;
+            let means = self.losses.drain(..).map(|(name, sum, count)| LossRow {
+                step,
+                name: name.into(),
+                value: sum / count as f32,
+            });
+            self.progress.losses.extend(means);
+        }
+    }
+
+    fn evaluate(&mut self) -> Result<Event> {
+        let episodes = self.config.evaluation_episodes;
+        let evaluation = self.judge.evaluate(self.agent.as_mut(), episodes, Starts::Training)?;
+        let row = EvaluationRow::new(self.progress.step, evaluation.summary());
+        self.evaluated_at = Some(self.progress.step);
+        self.progress.evaluations.push(row.clone());
+        Ok(Event::Evaluated(row))
+    }
+
+    fn test(&mut self) -> Result<Event> {
+        let episodes = self.config.test_episodes;
+        let test = self.judge.evaluate(self.agent.as_mut(), episodes, Starts::Test)?;
+        self.save()?;
+        let rows = test.episodes.iter().enumerate();
+        let rows = rows.map(|(i, episode)| (i + 1, episode));
+        write_csv(&self.folder.join("test.csv"), &TEST_COLUMNS, rows)?;
+        let summary = toml::to_string(&test.summary()).expect("a summary is TOML");
+        files::write(&self.folder.join("summary.toml"), summary.as_bytes())?;
+        Ok(Event::Tested(test))
+    }
+
+    /// Writes the checkpoint, the weights and the CSV files. A run that is resumed starts its
+    /// present episode anew.
+    ///
+    /// # Errors
+    /// If a file cannot be written; what was written before is then still there.
+    pub fn save(&mut self) -> Result<()> {
+        self.progress.seconds += self.clock.elapsed().as_secs_f64();
+        self.clock = Instant::now();
+        self.last_save = self.clock;
+        let weights = self.agent.weights();
+        if self.config.learns() {
+            let mut state = self.agent.training_state();
+            state.absorb("weights.", &weights);
+            state.set_note("progress", serde_json::to_string(&self.progress).expect("progress is JSON"));
+            state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
+            weights.write(&self.folder.join("weights.safetensors"))?;
+        }
+        let Progress { episodes, evaluations, losses, .. } = &self.progress;
+        write_csv(&self.folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
+        write_csv(&self.folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations.iter())?;
+        write_csv(&self.folder.join("losses.csv"), &["step", "name", "value"], losses.iter())
+    }
+}
+
+const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "length", "seconds"];
+const EVALUATION_COLUMNS: [&str; 8] = [
+    "step",
+    "episodes",
+    "success",
+    "return_mean",
+    "return_std",
+    "smoothness_sparc",
+    "smoothness_ldlj",
+    "action_ms",
+];
+const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
+
+/// Whether the run in `folder` is complete.
+pub fn is_complete(folder: &Path) -> bool {
+    folder.join("summary.toml").exists()
+}
+
+/// The agent that a run in `folder` has learned.
+///
+/// # Errors
+/// If there is no run, or its weights are missing or damaged.
+pub fn trained_agent(folder: &Path) -> Result<(RunConfig, Box<dyn Agent>)> {
+    let config = RunConfig::read(&folder.join("config.toml"))?;
+    let mut agent = config.agent()?;
+    if config.learns() {
+        let path = folder.join("weights.safetensors");
+        let weights = Weights::read(&path)?;
+        agent.load_weights(&weights).map_err(|problem| Error::bad_file(&path, problem))?;
+    }
+    Ok((config, agent))
+}
+
+fn load(path: &Path, agent: &mut dyn Agent) -> Result<Progress> {
+    let foreign = |problem: Error| {
+        Error::bad_file(path, format!("not a checkpoint of this run ({problem}); remove it to start anew"))
+    };
+    let state = Weights::read(path)?;
+    let progress = state
+        .note("progress")
+        .and_then(|json| serde_json::from_str(json).ok())
+        .ok_or_else(|| foreign(Error::BadSetting("it tells no progress".into())))?;
+    agent.load_weights(&state.extract("weights.")).map_err(foreign)?;
+    agent.load_training_state(&state).map_err(foreign)?;
+    Ok(progress)
+}
+
+/// The first setting in which two configurations differ.
+fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
+    let [there, wanted] = [there, wanted].map(|c| toml::Table::try_from(c).expect("a configuration is TOML"));
+    let keys = there.keys().chain(wanted.keys());
+    let mut keys = keys.filter(|key| there.get(*key) != wanted.get(*key));
+    keys.next().map(|key| {
+        let show = |table: &toml::Table| table.get(key).map_or("nothing".into(), ToString::to_string);
+        format!("its `{key}` is {}, not {}", show(&there), show(&wanted))
+    })
+}
+
+fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
+    let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
+    let composed = writer.write_record(columns).and_then(|()| {
+        rows.into_iter().try_for_each(|row| writer.serialize(row))
+    });
+    composed.map_err(|problem| Error::bad_file(path, problem))?;
+    let bytes = writer.into_inner().map_err(|problem| Error::bad_file(path, problem))?;
+    files::write(path, &bytes)
+}

@@ -1,0 +1,69 @@
+//! How smooth a movement is.
+//!
+//! Both measures look at the movement alone: the part between the first and the last moment at which
+//! the hand is faster than a twentieth of its top speed.
+
+use rustfft::FftPlanner;
+use rustfft::num_complex::Complex;
+
+/// Speeds below this fraction of the top speed are rest.
+const REST: f64 = 0.05;
+/// SPARC looks at frequencies up to this, Hz (and never beyond half the sampling rate).
+const CUT_OFF: f64 = 10.0;
+/// ... and from the first to the last of them whose magnitude is at least this part of the largest.
+const THRESHOLD: f64 = 0.05;
+
+/// Smoothness of a path of hand positions (m) sampled every `dt` seconds: SPARC and LDLJ. `None`
+/// where nothing moves.
+pub fn of_path(path: &[[f64; 3]], dt: f64) -> Option<(f64, f64)> {
+    let velocity: Vec<[f64; 3]> =
+        path.windows(2).map(|p| std::array::from_fn(|i| (p[1][i] - p[0][i]) / dt)).collect();
+    let speed: Vec<f64> = velocity.iter().map(norm).collect();
+    let top = speed.iter().copied().fold(0.0, f64::max);
+    let moving = |v: &&f64| **v >= REST * top;
+    if top < 1e-3 {
+        return None;
+    }
+    let first = speed.iter().position(|v| moving(&v))?;
+    let last = speed.iter().rposition(|v| moving(&v))?;
+    (last - first >= 3).then(|| (sparc(&speed[first..=last], 1.0 / dt), ldlj(&velocity[first..=last], 1.0 / dt)))
+}
+
+fn norm(v: &[f64; 3]) -> f64 {
+    v.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+/// Spectral arc length of a speed profile sampled at `rate` Hz (Balasubramanian et al. 2015):
+/// dimensionless, the same for slow and fast, near and far; a minimum-jerk movement has about -1.4, and
+/// less smooth ones are more negative.
+pub fn sparc(speed: &[f64], rate: f64) -> f64 {
+    let bins = (speed.len().next_power_of_two() << 4).max(16);
+    let mut spectrum: Vec<Complex<f64>> = speed.iter().map(|&v| v.into()).collect();
+    spectrum.resize(bins, 0.0.into());
+    FftPlanner::new().plan_fft_forward(bins).process(&mut spectrum);
+    let step = rate / bins as f64;
+    let kept = ((CUT_OFF.min(rate / 2.0) / step) as usize + 1).min(bins / 2 + 1);
+    let magnitude: Vec<f64> = spectrum[..kept].iter().map(|c| c.norm()).collect();
+    let largest = magnitude.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+    let relative: Vec<f64> = magnitude.iter().map(|m| m / largest).collect();
+    let loud = |m: &f64| *m >= THRESHOLD;
+    let (Some(first), Some(last)) = (relative.iter().position(loud), relative.iter().rposition(loud)) else {
+        return 0.0;
+    };
+    let width = 1.0 / (last - first).max(1) as f64;
+    -relative[first..=last].windows(2).map(|m| width.hypot(m[1] - m[0])).sum::<f64>()
+}
+
+/// Log dimensionless jerk of a velocity sampled at `rate` Hz: minus the logarithm of squared jerk, made
+/// independent of duration and top speed. A minimum-jerk movement has about -5.3. Very sensitive to noise and to the
+/// sampling rate: compare only at equal rates.
+pub fn ldlj(velocity: &[[f64; 3]], rate: f64) -> f64 {
+    let dt = 1.0 / rate;
+    let duration = velocity.len() as f64 * dt;
+    let top = velocity.iter().map(norm).fold(0.0, f64::max);
+    let jerk = velocity.windows(3).map(|v| {
+        let jerk: [f64; 3] = std::array::from_fn(|i| (v[2][i] - 2.0 * v[1][i] + v[0][i]) / (dt * dt));
+        norm(&jerk).powi(2) * dt
+    });
+    -(duration.powi(3) / (top * top) * jerk.sum::<f64>()).ln()
+}

@@ -1,0 +1,67 @@
+//! What may be concluded from a few runs.
+
+use rand::RngExt;
+
+use crate::rng::Rng;
+
+/// The Wilson interval (95 %) of a success rate seen in `n` trials.
+pub fn wilson(successes: usize, n: usize) -> [f64; 2] {
+    if n == 0 {
+        return [0.0, 1.0];
+    }
+    const Z: f64 = 1.959_963_984_540_054;
+    let (n, p) = (n as f64, successes as f64 / n as f64);
+    let centre = (p + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
+    let half = Z / (1.0 + Z * Z / n) * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
+    [centre - half, centre + half]
+}
+
+/// The mean of the middle half: a quarter of the values, rounded down, is dropped at each end.
+pub fn interquartile_mean(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let drop = sorted.len() / 4;
+    mean(&sorted[drop..sorted.len() - drop])
+}
+
+/// The mean; not a number if there is nothing.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// The standard deviation of the values themselves (not of a larger population).
+pub fn deviation(values: &[f64]) -> f64 {
+    let centre = mean(values);
+    (values.iter().map(|v| (v - centre).powi(2)).sum::<f64>() / values.len() as f64).sqrt()
+}
+
+/// A 95 % percentile-bootstrap interval of a statistic over runs.
+pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rng) -> [f64; 2] {
+    const DRAWS: usize = 5000;
+    let mut drawn: Vec<f64> = (0..DRAWS)
+        .map(|_| {
+            let again: Vec<f64> = values.iter().map(|_| values[rng.random_range(0..values.len())]).collect();
+            statistic(&again)
+        })
+        .collect();
+    drawn.sort_by(f64::total_cmp);
+    [0.025, 0.975].map(|q| drawn[(q * (DRAWS - 1) as f64).round() as usize])
+}
+
+/// Area under a success curve from its first to its last step, divided by that distance: the mean success during
+/// training.
+pub fn area_under_curve(steps: &[f64], success: &[f64]) -> f64 {
+    let pieces = steps.windows(2).zip(success.windows(2));
+    let area: f64 = pieces.map(|(x, y)| (x[1] - x[0]) * (y[0] + y[1]) / 2.0).sum();
+    area / (steps.last().unwrap_or(&0.0) - steps.first().unwrap_or(&0.0))
+}
+
+/// The step at which a success curve first reaches `level`, interpolated; `None` if it never does.
+pub fn steps_to(level: f64, steps: &[f64], success: &[f64]) -> Option<f64> {
+    let reached = success.iter().position(|s| *s >= level)?;
+    if reached == 0 {
+        return Some(steps[0]);
+    }
+    let (x0, x1, y0, y1) = (steps[reached - 1], steps[reached], success[reached - 1], success[reached]);
+    Some(x0 + (x1 - x0) * (level - y0) / (y1 - y0))
+}

@@ -1,0 +1,260 @@
+//! From the folders of runs to the tables of a study: `evaluations.csv` and `tests.csv` hold every
+//! run's numbers, `summary.csv` one row for each task and method. Figures and report are made from these three
+//! files alone.
+
+use std::path::Path;
+
+use polars::prelude::*;
+
+use super::config::RunConfig;
+use super::statistics::{area_under_curve, bootstrap, interquartile_mean, mean, steps_to, wilson};
+use crate::error::{Error, Result};
+use crate::files;
+use crate::rng;
+
+/// A success rate counts as reached at this level, in the column `steps_to_80`.
+pub const LEVEL: f64 = 0.8;
+
+/// The tables of a study.
+#[derive(Clone, Debug)]
+pub struct Tables {
+    /// task, method, seed, step, success, ...: every evaluation of every learning run.
+    pub evaluations: DataFrame,
+    /// task, method, seed, episode, return, success, ...: every test episode.
+    pub tests: DataFrame,
+    /// One row for each task and method.
+    pub summary: DataFrame,
+}
+
+impl Tables {
+    /// Gathers the tables from the folders of runs.
+    ///
+    /// # Errors
+    /// If a run's files are missing or damaged.
+    pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
+        let (mut evaluations, mut tests) = (Vec::new(), Vec::new());
+        for folder in folders {
+            let config = RunConfig::read(&folder.join("config.toml"))?;
+            let labelled = |file: &str| -> Result<LazyFrame> {
+                let frame = read(&folder.join(file))?.lazy();
+                Ok(frame.select([
+                    lit(config.task.name()).alias("task"),
+                    lit(config.method.as_str()).alias("method"),
+                    lit(config.seed).alias("seed"),
+                    all().as_expr(),
+                ]))
+            };
+            tests.push(labelled("test.csv")?);
+            if config.learns() {
+                evaluations.push(labelled("evaluations.csv")?);
+            }
+        }
+        let join = |frames: Vec<LazyFrame>| {
+            let options = UnionArgs { to_supertypes: true, ..UnionArgs::default() };
+            if frames.is_empty() { Ok(DataFrame::empty()) } else { concat(frames, options)?.collect() }
+        };
+        let evaluations = join(evaluations).map_err(inside)?;
+        let tests = join(tests).map_err(inside)?;
+        let summary = summarise(&evaluations, &tests).map_err(inside)?;
+        Ok(Self { evaluations, tests, summary })
+    }
+
+    /// Reads the tables of a study from its folder.
+    ///
+    /// # Errors
+    /// If one is missing or damaged.
+    pub fn read(folder: &Path) -> Result<Self> {
+        Ok(Self {
+            evaluations: read(&folder.join("evaluations.csv"))?,
+            tests: read(&folder.join("tests.csv"))?,
+            summary: read(&folder.join("summary.csv"))?,
+        })
+    }
+
+    /// Writes the tables into a study's folder.
+    ///
+    /// # Errors
+    /// If a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let tables = [("evaluations.csv", &self.evaluations), ("tests.csv", &self.tests), ("summary.csv", &self.summary)];
+        for (name, table) in tables {
+            let mut bytes = Vec::new();
+            if table.width() > 0 {
+                CsvWriter::new(&mut bytes).finish(&mut table.clone()).map_err(inside)?;
+            }
+            files::write(&folder.join(name), &bytes)?;
+        }
+        Ok(())
+    }
+
+    /// Tasks and methods, in the order in which they were run.
+    pub fn tasks_and_methods(&self) -> Result<Vec<(String, String)>> {
+        let rows = |column: &str| strings(&self.summary, column).map_err(inside);
+        Ok(rows("task")?.into_iter().zip(rows("method")?).collect())
+    }
+
+    /// The success curves of a method: for each seed, steps and success rates.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn curves(&self, task: &str, method: &str) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
+        curves(&self.evaluations, task, method).map_err(inside)
+    }
+
+    /// A number of the summary, if it has one there.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn value(&self, task: &str, method: &str, column: &str) -> Result<Option<f64>> {
+        let found = || -> PolarsResult<Option<f64>> {
+            let row = of(&self.summary, task, method)?;
+            Ok(numbers(&row, column)?.into_iter().next().flatten())
+        };
+        found().map_err(inside)
+    }
+}
+
+fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFrame> {
+    let pairs = tests.clone().lazy().select([col("task"), col("method")]);
+    let pairs = pairs.unique_stable(None, UniqueKeepStrategy::First).collect()?;
+    let (tasks, methods) = (strings(&pairs, "task")?, strings(&pairs, "method")?);
+    let mut columns: Vec<(&str, Vec<Option<f64>>)> = SUMMARY.map(|name| (name, Vec::new())).into();
+    for (task, method) in tasks.iter().zip(&methods) {
+        let rows = of(tests, task, method)?;
+        let successes: Vec<f64> = booleans(&rows, "success")?;
+        let mean_of = |column: &str| -> PolarsResult<Option<f64>> {
+            let known: Vec<f64> = numbers(&rows, column)?.into_iter().flatten().collect();
+            Ok((!known.is_empty()).then(|| mean(&known)))
+        };
+        let [low, high] = wilson(successes.iter().filter(|s| **s > 0.5).count(), successes.len());
+        let by_seed = by_seed(&rows, &successes)?;
+        let bound = bootstrap(&by_seed, interquartile_mean, &mut rng::stream(0, "bootstrap"));
+        let curves = curves(evaluations, task, method)?;
+        let reached: Vec<f64> = curves.iter().filter_map(|(x, y)| steps_to(LEVEL, x, y)).collect();
+        let areas: Vec<f64> = curves.iter().map(|(x, y)| area_under_curve(x, y)).collect();
+        let budget = curves.iter().filter_map(|(x, _)| x.last().copied()).fold(None, |a: Option<f64>, x| {
+            Some(a.map_or(x, |a| a.max(x)))
+        });
+        // The median over all seeds; a seed that never gets there counts as infinitely many steps.
+        let median = (!curves.is_empty()).then(|| median_with_missing(&reached, curves.len())).flatten();
+        let values = [
+            Some(by_seed.len() as f64),
+            budget,
+            Some(successes.len() as f64),
+            Some(mean(&successes)),
+            Some(low),
+            Some(high),
+            Some(interquartile_mean(&by_seed)),
+            Some(bound[0]),
+            Some(bound[1]),
+            mean_of("return")?,
+            mean_of("length")?,
+            median,
+            (!curves.is_empty()).then(|| reached.len() as f64),
+            (!areas.is_empty()).then(|| mean(&areas)),
+            mean_of("sparc")?,
+            mean_of("ldlj")?,
+        ];
+        columns.iter_mut().zip(values).for_each(|((_, column), value)| column.push(value));
+    }
+    let mut all = vec![
+        Column::new("task".into(), tasks),
+        Column::new("method".into(), methods),
+    ];
+    all.extend(columns.into_iter().map(|(name, values)| Column::new(name.into(), values)));
+    DataFrame::new_infer_height(all)
+}
+
+const SUMMARY: [&str; 16] = [
+    "seeds",
+    "steps",
+    "test_episodes",
+    "success",
+    "success_low",
+    "success_high",
+    "success_iqm",
+    "success_iqm_low",
+    "success_iqm_high",
+    "return_mean",
+    "length_mean",
+    "steps_to_80",
+    "seeds_reaching_80",
+    "area_under_curve",
+    "smoothness_sparc",
+    "smoothness_ldlj",
+];
+
+/// The median of `n` values of which only the smaller ones are known; `None` if it is not among them.
+fn median_with_missing(known: &[f64], n: usize) -> Option<f64> {
+    let mut sorted = known.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let (low, high) = (sorted.get((n - 1) / 2)?, sorted.get(n / 2)?);
+    Some((low + high) / 2.0)
+}
+
+fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
+    if frame.width() == 0 {
+        return Ok(frame.clone());
+    }
+    let here = col("task").eq(lit(task)).and(col("method").eq(lit(method)));
+    frame.clone().lazy().filter(here).collect()
+}
+
+/// The success rate of each seed.
+fn by_seed(rows: &DataFrame, successes: &[f64]) -> PolarsResult<Vec<f64>> {
+    let seeds: Vec<f64> = numbers(rows, "seed")?.into_iter().flatten().collect();
+    let mut distinct = seeds.clone();
+    distinct.dedup();
+    let of = |seed: &f64| {
+        let own: Vec<f64> = seeds.iter().zip(successes).filter(|(s, _)| *s == seed).map(|(_, y)| *y).collect();
+        mean(&own)
+    };
+    Ok(distinct.iter().map(of).collect())
+}
+
+fn curves(evaluations: &DataFrame, task: &str, method: &str) -> PolarsResult<Vec<(Vec<f64>, Vec<f64>)>> {
+    let rows = of(evaluations, task, method)?;
+    if rows.height() == 0 {
+        return Ok(Vec::new());
+    }
+    let column = |name: &str| -> PolarsResult<Vec<f64>> { Ok(numbers(&rows, name)?.into_iter().flatten().collect()) };
+    let (seeds, steps, success) = (column("seed")?, column("step")?, column("success")?);
+    let mut curves: Vec<(f64, Vec<f64>, Vec<f64>)> = Vec::new();
+    for ((seed, step), success) in seeds.into_iter().zip(steps).zip(success) {
+        if curves.last().is_none_or(|(last, ..)| *last != seed) {
+            curves.push((seed, Vec::new(), Vec::new()));
+        }
+        let (_, x, y) = curves.last_mut().expect("one was just added");
+        x.push(step);
+        y.push(success);
+    }
+    Ok(curves.into_iter().map(|(_, x, y)| (x, y)).collect())
+}
+
+fn strings(frame: &DataFrame, column: &str) -> PolarsResult<Vec<String>> {
+    Ok(frame.column(column)?.str()?.iter().map(|s| s.unwrap_or_default().to_string()).collect())
+}
+
+fn numbers(frame: &DataFrame, column: &str) -> PolarsResult<Vec<Option<f64>>> {
+    let column = frame.column(column)?.cast(&DataType::Float64)?;
+    Ok(column.f64()?.iter().collect())
+}
+
+fn booleans(frame: &DataFrame, column: &str) -> PolarsResult<Vec<f64>> {
+    Ok(frame.column(column)?.bool()?.iter().map(|b| f64::from(b == Some(true))).collect())
+}
+
+fn read(path: &Path) -> Result<DataFrame> {
+    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+    if bytes.is_empty() {
+        return Ok(DataFrame::empty());
+    }
+    let reader = CsvReadOptions::default().with_infer_schema_length(None);
+    let reader = reader.into_reader_with_file_handle(std::io::Cursor::new(bytes));
+    reader.finish().map_err(|problem| Error::bad_file(path, format!("no table of ours ({problem})")))
+}
+
+/// A table of ours that lacks something: it was changed by hand, or comes from another version.
+fn inside(problem: PolarsError) -> Error {
+    Error::BadSetting(format!("the study's tables do not fit together: {problem}"))
+}

@@ -1,0 +1,164 @@
+//! An episode as one HTML file with a 3D replay: it opens from the disk and asks nothing of the
+//! network. `README.md` beside this file tells what its parts are.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use crate::agent::Agent;
+use crate::env::arm::{Pose, Primitive, PrimitiveKind};
+use crate::env::scene::Body;
+use crate::env::{Env, World};
+use crate::agent::Mode;
+use crate::error::Result;
+use crate::files;
+
+const PAGE: &str = include_str!("viewer.html");
+const VIEWER: &str = include_str!("viewer.js");
+const THREE: &str = include_str!("three.bundle.js");
+
+/// An episode as the page draws it.
+#[derive(Clone, Debug, Serialize)]
+pub struct Recording {
+    title: String,
+    task: String,
+    dt: f64,
+    up: &'static str,
+    camera: Camera,
+    bodies: Vec<DrawnBody>,
+    frames: Vec<Frame>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct Camera {
+    eye: [f64; 3],
+    target: [f64; 3],
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct DrawnBody {
+    name: String,
+    color: &'static str,
+    kind: &'static str,
+    shapes: Vec<DrawnShape>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+enum DrawnShape {
+    Box { half: [f64; 3], pose: [f64; 7] },
+    Capsule { radius: f64, half_length: f64, pose: [f64; 7] },
+    Cylinder { radius: f64, half_length: f64, pose: [f64; 7] },
+    Ball { radius: f64, pose: [f64; 7] },
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct Frame {
+    poses: Vec<[f64; 7]>,
+    reward: f32,
+    success: bool,
+    action: Vec<f32>,
+}
+
+impl Recording {
+    /// Lets an agent act, at its best, in the episode of that seed.
+    ///
+    /// # Errors
+    /// If the world cannot take the agent's actions.
+    pub fn of_episode(title: String, world: &mut World, agent: &mut dyn Agent, seed: u64) -> Result<Self> {
+        let mut obs = world.reset(seed);
+        let bodies = world.scene().iter().map(drawn).collect();
+        let rest = vec![0.0; world.spec().action_size];
+        let mut frames = vec![Frame { poses: poses(world), reward: 0.0, success: false, action: rest }];
+        loop {
+            let action = agent.act(&obs, Mode::Evaluate);
+            let step = world.step(&action)?;
+            frames.push(Frame { poses: poses(world), reward: step.reward, success: step.success, action });
+            if step.done() {
+                break;
+            }
+            obs = step.observation;
+        }
+        let camera = match world {
+            World::Tabletop(_) => Camera { eye: [1.15, -1.25, 1.55], target: [-0.12, 0.0, 0.92] },
+            World::Pendulum(_) => Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] },
+            World::CartPole(_) => Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] },
+        };
+        let spec = world.spec();
+        Ok(Self { title, task: spec.name.clone(), dt: spec.dt, up: "z", camera, bodies, frames })
+    }
+
+    /// Steps in the episode.
+    pub fn steps(&self) -> usize {
+        self.frames.len() - 1
+    }
+
+    /// Whether the task was fulfilled at the last step.
+    pub fn success(&self) -> bool {
+        self.frames.last().is_some_and(|frame| frame.success)
+    }
+
+    /// The page.
+    pub fn to_html(&self) -> String {
+        // In JSON, `<` may be written so, and no name can then close the script around it.
+        let json = serde_json::to_string(self).expect("a recording is JSON").replace('<', "\\u003c");
+        let escape = |text: &str| {
+            text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+        };
+        let title = escape(&self.title);
+        // One pass: what has been filled in is not searched again.
+        let mut page = String::new();
+        let mut rest = PAGE;
+        while let Some((before, after)) = rest.split_once("{{") {
+            let (name, after) = after.split_once("}}").expect("placeholders are closed");
+            page.push_str(before);
+            page.push_str(match name {
+                "title" => &title,
+                "recording" => &json,
+                "three" => THREE,
+                "viewer" => VIEWER,
+                other => panic!("the page has no part called {other}"),
+            });
+            rest = after;
+        }
+        page.push_str(rest);
+        page
+    }
+
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        files::write(path, self.to_html().as_bytes())
+    }
+}
+
+fn poses(world: &World) -> Vec<[f64; 7]> {
+    world.poses().iter().map(numbers).collect()
+}
+
+fn numbers(pose: &Pose) -> [f64; 7] {
+    let (p, q) = (pose.translation.vector, pose.rotation.coords);
+    // A tenth of a millimetre is finer than a screen.
+    [p.x, p.y, p.z, q.x, q.y, q.z, q.w].map(|x| (x * 1e4).round() / 1e4)
+}
+
+fn drawn(body: &Body) -> DrawnBody {
+    DrawnBody {
+        name: body.name.clone(),
+        color: body.color,
+        kind: if body.goal { "goal" } else { "solid" },
+        shapes: body.shapes.iter().map(drawn_shape).collect(),
+    }
+}
+
+fn drawn_shape(shape: &Primitive) -> DrawnShape {
+    let pose = numbers(&shape.pose);
+    match shape.kind {
+        PrimitiveKind::Box(half) => DrawnShape::Box { half: half.into(), pose },
+        PrimitiveKind::Capsule(radius, half_length) => DrawnShape::Capsule { radius, half_length, pose },
+        PrimitiveKind::Cylinder(radius, half_length) => DrawnShape::Cylinder { radius, half_length, pose },
+        PrimitiveKind::Ball(radius) => DrawnShape::Ball { radius, pose },
+    }
+}
