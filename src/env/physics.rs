@@ -20,7 +20,7 @@ pub const TIMESTEP: f64 = 1.0 / (CONTROL_HZ * STEPS_PER_CONTROL as f64);
 /// Substeps of the solver in a physics step. A grasp needs more: the hand moves on arcs, a held
 /// object in straight lines from substep to substep, and the difference is slip.
 const SUBSTEPS: usize = 1;
-const SUBSTEPS_HOLDING: usize = 4;
+const SUBSTEPS_HOLDING: usize = 6;
 
 /// A joint limit counts as near at this distance, far more than a joint moves in one step: rad, m.
 const HINGE_MARGIN: f64 = 0.1;

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::tables::Tables;
 use crate::error::{Error, Result};
@@ -34,15 +35,15 @@ type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
 pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
     let mut learning = Vec::new();
     let mut fixed = Vec::new();
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+    for (color, method) in methods(tables, task)? {
         let curves = tables.curves(task, &method)?;
         if curves.is_empty() {
-            fixed.push((tables.value(task, &method, "success")?.unwrap_or(0.0), method));
+            fixed.push((color, method.clone(), tables.value(task, &method, "success")?.unwrap_or(0.0)));
         } else {
-            learning.push((method, curves));
+            learning.push((color, method, curves));
         }
     }
-    let budget = learning.iter().flat_map(|(_, curves)| curves).filter_map(|(x, _)| x.last().copied());
+    let budget = learning.iter().flat_map(|(_, _, curves)| curves).filter_map(|(x, _)| x.last().copied());
     let budget = budget.fold(1.0, f64::max);
     draw(path, |area| {
         let mut chart = ChartBuilder::on(&area)
@@ -63,9 +64,8 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
             .y_label_formatter(&|y| format!("{:.0} %", 100.0 * y))
             .label_style((FONT, 14))
             .draw()?;
-        let mut palette = PALETTE.iter().cycle();
-        for (method, curves) in &learning {
-            let color = *palette.next().expect("an endless palette");
+        for (color, method, curves) in &learning {
+            let color = *color;
             let (steps, band) = band(curves);
             let outline = steps.iter().zip(&band).map(|(x, [low, _, _])| (*x, *low));
             let back = steps.iter().zip(&band).rev().map(|(x, [_, _, high])| (*x, *high));
@@ -80,8 +80,8 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
                 .label(label)
                 .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(3)));
         }
-        for (success, method) in &fixed {
-            let color = *palette.next().expect("an endless palette");
+        for (color, method, success) in &fixed {
+            let color = *color;
             let ends = [(0.0, *success), (budget, *success)];
             chart
                 .draw_series(DashedLineSeries::new(ends, 7, 5, color.stroke_width(2)))?
@@ -106,20 +106,18 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
 /// If the tables lack a column or the file cannot be written.
 pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
     let mut rows = Vec::new();
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+    for (color, method) in methods(tables, task)? {
         let value = |column: &str| tables.value(task, &method, column);
         let success = [value("success_low")?, value("success")?, value("success_high")?].map(|v| v.unwrap_or(0.0));
         let sparc = value("smoothness_sparc")?;
-        rows.push((method, success, sparc));
+        rows.push((color, method, success, sparc));
     }
-    let roughest = rows.iter().filter_map(|(_, _, sparc)| *sparc).fold(-2.0, f64::min);
+    let roughest = rows.iter().filter_map(|(.., sparc)| *sparc).fold(-2.0, f64::min);
     let count = rows.len();
     draw(path, |area| {
-        area.titled(&format!("{task}: the test at the end"), (FONT, 20))?;
-        let area = area.margin(40, 10, 10, 10);
+        let area = area.margin(14, 10, 10, 10).titled(&format!("{task}: the test at the end"), (FONT, 20))?;
         let (left, right) = area.split_horizontally(470);
         let panel = |area: &Area, title: &str, left_margin: u32, from: f64, to: f64, percent: bool| -> Drawn {
-            let names: Vec<String> = rows.iter().map(|(method, ..)| method.clone()).collect();
             let mut chart = ChartBuilder::on(area)
                 .caption(title, (FONT, 15))
                 .margin(8)
@@ -137,8 +135,7 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
                 .x_label_formatter(&|x| if percent { format!("{:.0} %", 100.0 * x) } else { format!("{x:.1}") })
                 .label_style((FONT, 14))
                 .draw()?;
-            for (i, (_, [low, mid, high], sparc)) in rows.iter().enumerate() {
-                let color = PALETTE[i % PALETTE.len()];
+            for (i, (color, method, [low, mid, high], sparc)) in rows.iter().enumerate() {
                 let y = (count - 1 - i) as f64;
                 if percent {
                     chart.draw_series([PathElement::new([(*low, y), (*high, y)], color.stroke_width(3))])?;
@@ -148,11 +145,9 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
                 }
                 if left_margin > 0 {
                     let at = chart.backend_coord(&(from, y));
-                    let style = (FONT, 15).into_font().color(&BLACK);
-                    let (width, _) = area.estimate_text_size(&names[i], &style)?;
                     let corner = area.get_base_pixel();
-                    let place = (at.0 - corner.0 - width as i32 - 10, at.1 - corner.1 - 8);
-                    area.draw_text(&names[i], &style, place)?;
+                    let style = (FONT, 15).into_font().color(&BLACK).pos(Pos::new(HPos::Right, VPos::Center));
+                    area.draw_text(method, &style, (at.0 - corner.0 - 12, at.1 - corner.1))?;
                 }
             }
             Ok(())
@@ -160,6 +155,12 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         panel(&left, "success, 95 % interval", 110, 0.0, 1.03, true)?;
         panel(&right, "smoothness (SPARC; a perfect movement has -1.4)", 0, roughest * 1.1, -1.0, false)
     })
+}
+
+/// The methods of a task, each with its colour, the same in every figure.
+fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
+    let of_task = tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task).map(|(_, method)| method);
+    Ok(PALETTE.iter().cycle().copied().zip(of_task).collect())
 }
 
 /// Steps common to all seeds, with the lowest, mean and highest value at each.

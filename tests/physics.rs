@@ -1,0 +1,293 @@
+//! The arm against robosuite's: kinematics, inertia, step responses, fingers, grasp.
+//! The reference numbers stand in `data/reference/panda.toml`.
+
+use handful::env::Env;
+use handful::env::arm::{ArmDescription, JointVector, Pose};
+use handful::env::kinematics::{KinematicModel, Kinematics};
+use handful::env::osc::{Goal, OperationalSpaceController};
+use handful::env::physics::{Physics, STEPS_PER_CONTROL};
+use handful::env::tabletop::{ActionKind, Lift, TableOptions, Tabletop};
+use handful::rng;
+use nalgebra::Vector3;
+use serde::Deserialize;
+
+/// robosuite's numbers are rounded to three decimals.
+const KINEMATICS_TOLERANCE: f64 = 1e-3;
+/// What robosuite's sums of masses round to, in N m; its gravity torques reach 25.
+const GRAVITY_TOLERANCE: f64 = 3e-3;
+
+#[derive(Deserialize)]
+struct Reference {
+    kinematics: Vec<KinematicsRow>,
+    step_response: Vec<StepResponse>,
+    gripper: Vec<GripperTrace>,
+}
+
+#[derive(Deserialize)]
+#[allow(non_snake_case)]
+struct KinematicsRow {
+    name: String,
+    q: [f64; 7],
+    p: [f64; 3],
+    R: [f64; 9],
+    mass_diagonal: [f64; 7],
+    gravity: [f64; 7],
+    #[serde(default)]
+    mass_off_diagonal: Vec<(usize, usize, f64)>,
+    linear_jacobian: Option<[[f64; 7]; 3]>,
+}
+
+#[derive(Deserialize)]
+struct StepResponse {
+    action: [f32; 3],
+    mm: Vec<f64>,
+}
+
+#[derive(Deserialize)]
+struct GripperTrace {
+    name: String,
+    action: f64,
+    start_mm: f64,
+    target_mm: f64,
+    mm: Vec<f64>,
+}
+
+fn reference() -> Reference {
+    toml::from_str(include_str!("../data/reference/panda.toml")).expect("the reference file is well-formed")
+}
+
+fn close(what: &str, ours: f64, theirs: f64, tolerance: f64) {
+    assert!((ours - theirs).abs() <= tolerance, "{what}: {ours} here, {theirs} in robosuite (tolerance {tolerance})");
+}
+
+fn kinematics(q: &[f64; 7]) -> Kinematics {
+    KinematicModel::new(&ArmDescription::panda()).at(&JointVector::from(*q))
+}
+
+#[test]
+fn kinematics_and_mass_matrix_are_those_of_robosuite() {
+    let base = ArmDescription::panda().base.translation.vector;
+    for row in reference().kinematics {
+        let at = kinematics(&row.q);
+        let (p, r) = (at.grip.translation.vector - base, at.grip.rotation.to_rotation_matrix());
+        for i in 0..3 {
+            close(&format!("{}: p[{i}]", row.name), p[i], row.p[i], KINEMATICS_TOLERANCE);
+            for j in 0..3 {
+                close(&format!("{}: R[{i},{j}]", row.name), r[(i, j)], row.R[3 * i + j], KINEMATICS_TOLERANCE);
+            }
+        }
+        for i in 0..7 {
+            close(&format!("{}: M[{i},{i}]", row.name), at.mass[(i, i)], row.mass_diagonal[i], KINEMATICS_TOLERANCE);
+            close(&format!("{}: gravity[{i}]", row.name), at.gravity[i], row.gravity[i], GRAVITY_TOLERANCE);
+        }
+        if row.mass_off_diagonal.is_empty() {
+            continue;
+        }
+        for i in 0..7 {
+            for j in 0..i {
+                let named = row.mass_off_diagonal.iter().find(|(a, b, _)| (*a - 1, *b - 1) == (j, i));
+                let theirs = named.map_or(0.0, |(_, _, value)| *value);
+                close(&format!("{}: M[{i},{j}]", row.name), at.mass[(i, j)], theirs, KINEMATICS_TOLERANCE);
+                assert_eq!(at.mass[(i, j)], at.mass[(j, i)], "a symmetric matrix");
+            }
+        }
+        for (i, jacobian) in row.linear_jacobian.iter().flatten().enumerate() {
+            for (j, theirs) in jacobian.iter().enumerate() {
+                close(&format!("{}: J[{i},{j}]", row.name), at.linear[(i, j)], *theirs, KINEMATICS_TOLERANCE);
+            }
+        }
+    }
+}
+
+#[test]
+fn jacobians_are_the_derivatives_of_the_pose() {
+    let q = [0.3, -0.4, 0.5, -1.8, -0.6, 2.0, 0.7];
+    let at = kinematics(&q);
+    let h = 1e-6;
+    for j in 0..7 {
+        let moved = |by: f64| {
+            let mut q = q;
+            q[j] += by;
+            kinematics(&q).grip
+        };
+        let (back, ahead) = (moved(-h), moved(h));
+        let linear = (ahead.translation.vector - back.translation.vector) / (2.0 * h);
+        let angular = (ahead.rotation * back.rotation.inverse()).scaled_axis() / (2.0 * h);
+        assert!((linear - at.linear.column(j)).norm() < 1e-8, "linear, joint {j}");
+        assert!((angular - at.angular.column(j)).norm() < 1e-8, "angular, joint {j}");
+    }
+}
+
+/// The physics engine and our own equations agree: with torques tau, M qdd = tau - coriolis.
+#[test]
+fn the_engine_accelerates_as_the_equations_say() {
+    let arm = ArmDescription::panda();
+    let mut physics = Physics::new(arm.clone());
+    let mut rng = rng::stream(0, "torques");
+    let mut worst = 0.0_f64;
+    for i in 0..200 {
+        let before = physics.joint_state();
+        let at = physics.kinematics(&before.q);
+        // Slowly varying torques, far below the limits, that swing the arm about.
+        let torques = JointVector::from_fn(|j, _| 3.0 * (0.05 * f64::from(i) + j as f64).sin() + rng::normal(&mut rng));
+        physics.step(&torques, [0.0; 2]);
+        let after = physics.joint_state();
+        let damping = JointVector::from_fn(|j, _| arm.links[j].damping * before.qd[j]);
+        let friction = JointVector::from_fn(|j, _| {
+            let (link, timestep) = (&arm.links[j], handful::env::physics::TIMESTEP);
+            (link.armature * before.qd[j] / timestep + torques[j]).clamp(-link.friction, link.friction)
+        });
+        let expected = at.mass.cholesky().expect("positive definite").solve(&(torques - at.coriolis(&before.qd) - damping - friction));
+        let found = (after.qd - before.qd) / handful::env::physics::TIMESTEP;
+        worst = worst.max((found - expected).amax());
+    }
+    // The engine counts in f32 and treats Coriolis forces implicitly; accelerations here reach 5 rad/s2.
+    assert!(worst < 0.05, "accelerations differ by up to {worst} rad/s2");
+}
+
+fn pose_actions() -> TableOptions {
+    TableOptions { action: ActionKind::Pose, horizon: Some(10_000), ..TableOptions::default() }
+}
+
+/// The hand's path (mm from the start) under robosuite's pose action, from rest at home without noise.
+fn response(action: [f32; 3], steps: usize) -> Vec<Vector3<f64>> {
+    let arm = ArmDescription::panda();
+    let mut physics = Physics::new(arm.clone());
+    let start = physics.kinematics(&arm.home).grip;
+    let mut measured = start;
+    let goal = Goal { position: start.translation.vector, orientation: start.rotation };
+    let mut controller = OperationalSpaceController::new(&arm, goal, arm.home);
+    let lead = Vector3::from(action.map(|a| 0.05 * f64::from(a)));
+    let mut path = Vec::new();
+    for _ in 0..steps {
+        controller.goal = Goal { position: measured.translation.vector + lead, orientation: measured.rotation };
+        for _ in 0..STEPS_PER_CONTROL {
+            let joints = physics.joint_state();
+            let at = physics.kinematics(&joints.q);
+            measured = at.grip;
+            physics.step(&controller.torques(&at, &joints.q, &joints.qd), [0.0; 2]);
+        }
+        let now = physics.kinematics(&physics.joint_state().q).grip;
+        path.push((now.translation.vector - start.translation.vector) * 1e3);
+    }
+    path
+}
+
+#[test]
+fn the_hand_follows_an_action_as_in_robosuite() {
+    for StepResponse { action, mm } in reference().step_response {
+        let along = Vector3::from(action.map(f64::from));
+        for (i, (ours, theirs)) in response(action, mm.len()).iter().zip(&mm).enumerate() {
+            close(&format!("action {action:?}, step {}: mm", i + 1), ours.dot(&along), *theirs, 2.0);
+        }
+    }
+}
+
+#[test]
+fn the_fingers_move_as_in_robosuite() {
+    let arm = ArmDescription::panda();
+    for trace in reference().gripper {
+        let mut physics = Physics::new(arm.clone());
+        physics.set_joints(&arm.home, [trace.start_mm / 1e3; 2]);
+        let home = physics.kinematics(&arm.home).grip;
+        let goal = Goal { position: home.translation.vector, orientation: home.rotation };
+        let controller = OperationalSpaceController::new(&arm, goal, arm.home);
+        let gripper = &arm.gripper;
+        let mut target = trace.target_mm / 1e3;
+        for (i, theirs) in trace.mm.iter().enumerate() {
+            target = (target - trace.action * gripper.target_step).clamp(0.0, 0.04);
+            for _ in 0..STEPS_PER_CONTROL {
+                let joints = physics.joint_state();
+                let torques = controller.torques(&physics.kinematics(&joints.q), &joints.q, &joints.qd);
+                let servo = |q: f64| (gripper.stiffness * (target - q)).clamp(-gripper.max_force, gripper.max_force);
+                physics.step(&torques, joints.fingers.map(servo));
+            }
+            for finger in physics.joint_state().fingers {
+                close(&format!("{}, step {}: mm", trace.name, i + 1), finger * 1e3, *theirs, 1.0);
+            }
+        }
+    }
+}
+
+#[test]
+fn without_an_action_the_arm_holds_still() {
+    let mut env = Tabletop::new(&Lift, pose_actions());
+    env.reset(0);
+    let start = env.hand().expect("a hand");
+    for _ in 0..200 {
+        env.step(&[0.0; 7]).expect("a valid action");
+    }
+    let now = env.hand().expect("a hand");
+    let drift = (Vector3::from(now) - Vector3::from(start)).norm();
+    assert!(drift < 1e-3, "the hand drifted {:.3} mm in 200 steps", drift * 1e3);
+}
+
+/// A grasped cube, the hand above the table.
+fn grasped(seed: u64) -> Tabletop {
+    let mut env = Tabletop::new(&Lift, TableOptions { horizon: Some(10_000), ..TableOptions::default() });
+    let policy = handful::env::Task::Lift.scripted_policy(TableOptions::default()).expect("lift has one");
+    let mut obs = env.reset(seed);
+    for _ in 0..60 {
+        obs = env.step(&policy(&obs)).expect("a valid action").observation;
+    }
+    env
+}
+
+#[test]
+fn a_grasped_cube_does_not_slip() {
+    for seed in 0..3 {
+        for axis in 0..3 {
+            let mut env = grasped(seed);
+            let in_hand = |env: &Tabletop| -> Pose {
+                let physics = env.physics();
+                let hand = physics.kinematics(&physics.joint_state().q).grip;
+                hand.inverse() * physics.object_state(env.setup().objects[0]).pose
+            };
+            let start = in_hand(&env);
+            for step in 0..100 {
+                let mut action = [0.0, 0.0, 0.0, 1.0];
+                // To and fro at full speed, but never down to the table.
+                action[axis] = if (step / 10) % 2 == 0 || env.compact()[2] < 0.88 { 1.0 } else { -1.0 };
+                env.step(&action).expect("a valid action");
+            }
+            let end = in_hand(&env);
+            let slip = (end.translation.vector - start.translation.vector).norm() * 1e3;
+            let turn = end.rotation.angle_to(&start.rotation).to_degrees();
+            let cube = env.setup().objects[0];
+            let forces = env.physics().pad_forces(cube);
+            let sunk = env.physics().pad_penetrations(cube).into_iter().fold(0.0, f64::max) * 1e3;
+            assert!(slip < 1.0, "seed {seed}, axis {axis}: slipped {slip:.2} mm");
+            assert!(turn < 2.0, "seed {seed}, axis {axis}: turned {turn:.2} degrees");
+            assert!(sunk < 1.0, "seed {seed}, axis {axis}: the pads sank in by {sunk:.2} mm");
+            for force in forces {
+                assert!((18.0..22.0).contains(&force), "seed {seed}, axis {axis}: a pad presses with {force:.1} N");
+            }
+        }
+    }
+}
+
+#[test]
+fn pads_report_no_contact_from_5_mm_away() {
+    let arm = ArmDescription::panda();
+    let mut physics = Physics::new(arm.clone());
+    let grip = physics.kinematics(&arm.home).grip;
+    let half = 0.02;
+    // A cube between the open fingers, in the air: its faces are 5 mm from the pads.
+    let cube = physics.add_box([half; 3], 1000.0, 1.0, &grip);
+    physics.set_joints(&arm.home, [half + 0.005 + 0.0005; 2]);
+    let goal = Goal { position: grip.translation.vector, orientation: grip.rotation };
+    let controller = OperationalSpaceController::new(&arm, goal, arm.home);
+    for _ in 0..2 {
+        let joints = physics.joint_state();
+        let torques = controller.torques(&physics.kinematics(&joints.q), &joints.q, &joints.qd);
+        physics.step(&torques, [0.0; 2]);
+        assert_eq!(physics.pad_forces(cube), [0.0; 2], "5 mm is not contact");
+    }
+    // The same pads do report contact when they close.
+    for _ in 0..40 {
+        let joints = physics.joint_state();
+        let torques = controller.torques(&physics.kinematics(&joints.q), &joints.q, &joints.qd);
+        physics.step(&torques, [-20.0; 2]);
+    }
+    assert!(physics.pad_forces(cube).iter().all(|force| *force > 5.0), "closed pads touch");
+}
