@@ -167,17 +167,14 @@ impl Sac {
         losses
     }
 
-    /// y = r + discount (1 - terminated) (min_j Q'_j(s', a') - temperature log pi(a'|s')).
+    /// What the critics should say of a batch.
     fn targets(&mut self, batch: &Batch) -> Vec<f32> {
         let next = self.observations(&batch.next_obs);
         let head = self.policy.forward(next.clone(), Learning::Frozen);
         let (action, log_density) = SquashedGaussian::from_head(head).sample(self.noise(batch.size));
         let q = self.targets.forward(ops::join(next, action), Learning::Frozen);
         let q = q.min::<(usize, usize), Axis<0>>().as_vec();
-        let temperature = self.temperature();
-        let future = q.iter().zip(log_density.as_vec()).map(|(q, log)| q - temperature * log);
-        let steps = batch.rewards.iter().zip(&batch.terminated);
-        steps.zip(future).map(|((r, end), future)| r + self.config.discount * (1.0 - end) * future).collect()
+        soft_targets(batch, &q, &log_density.as_vec(), self.temperature(), self.config.discount)
     }
 
     fn update_critics(&mut self, batch: &Batch) -> Losses {
@@ -207,9 +204,7 @@ impl Sac {
         let (action, tape) = action.split_tape();
         let q = self.critics.forward(ops::join(obs.put_tape(tape), action), Learning::Frozen);
         let q = q.min::<(usize, usize), Axis<0>>().mean();
-        let (log_density, log_tape) = log_density.split_tape();
-        let entropy_term = log_density.put_tape(log_tape).mean() * self.temperature();
-        let loss = entropy_term - q;
+        let loss = log_density.mean() * self.temperature() - q;
         let policy_loss = loss.array();
         let mut gradients = loss.backward();
         let norm = self.policy_optimiser.step(&mut self.policy, &mut gradients);
@@ -316,6 +311,14 @@ impl Agent for Sac {
     }
 }
 
+/// y = r + discount (1 - terminated) (q - temperature log pi), where q is the smallest of the target critics'
+/// values of the next action, and log pi that action's log-density. An end by the clock is no end.
+fn soft_targets(batch: &Batch, q: &[f32], log_density: &[f32], temperature: f32, discount: f32) -> Vec<f32> {
+    let future = q.iter().zip(log_density).map(|(q, log)| q - temperature * log);
+    let steps = batch.rewards.iter().zip(&batch.terminated).zip(future);
+    steps.map(|((r, end), future)| r + discount * (1.0 - end) * future).collect()
+}
+
 /// One number that learns by Adam: the logarithm of the temperature.
 #[derive(Clone, Copy, Debug)]
 struct Temperature {
@@ -366,5 +369,29 @@ impl SacConfig {
             return Err(Error::BadSetting("sac: `initial_temperature` must be positive".into()));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn targets_bootstrap_unless_the_task_ended() {
+        let batch = Batch { size: 2, rewards: vec![1.0, -0.5], terminated: vec![0.0, 1.0], ..Batch::default() };
+        let y = soft_targets(&batch, &[4.5, 2.0], &[-0.8, 1.2], 0.2, 0.99);
+        assert!((y[0] - 5.6134).abs() < 1e-6 && (y[1] + 0.5).abs() < 1e-6, "{y:?}");
+    }
+
+    #[test]
+    fn too_much_entropy_cools() {
+        let log_densities = [2.259_300_94, -0.8, 0.5, 1.0_f32];
+        let mean = log_densities.iter().sum::<f32>() / 4.0;
+        let mut temperature = Temperature::new(1.0, 3e-4);
+        temperature.step(mean - 2.0);
+        assert!((temperature.log + 3e-4).abs() < 1e-8, "{}", temperature.log);
+        let mut temperature = Temperature::new(1.0, 3e-4);
+        temperature.step(3.0 - 2.0);
+        assert!(temperature.log > 0.0, "too little entropy heats");
     }
 }

@@ -32,22 +32,21 @@ impl<T: Tape<f32, Cpu>> SquashedGaussian<T> {
     /// The action for standard normal `noise` (`[1, batch, actions]`), and its log-density summed over
     /// the action's numbers, `[1, batch]`. Differentiable in the head (reparameterised).
     ///
+    /// The log-density carries the tape back to the head; the action's own tape begins at u. A loss in which
+    /// both occur has all of it.
+    ///
     /// ln(1 - tanh(u)^2) is computed as 2 (ln 2 - u - softplus(-2u)), which is exact where the usual
     /// ln(1 - a^2 + 1e-6) saturates.
     pub fn sample(self, noise: Tensor3) -> (Tensor3<T>, Tensor<(usize, usize), f32, Cpu, T>) {
-        let &(members, batch, _) = noise.shape();
-        let (log_std, tape) = self.log_std.split_tape();
-        let log_std = log_std.put_tape(tape);
-        let std = log_std.with_empty_tape().exp();
+        let std = self.log_std.with_empty_tape().exp();
         let u = self.mean + std * noise.clone();
+        let action = u.with_empty_tape().tanh();
         let half_log_tau = 0.5 * (2.0 * std::f32::consts::PI).ln();
-        let gaussian = -(log_std + (noise.square() * 0.5 + half_log_tau));
+        let gaussian = -(self.log_std + (noise.square() * 0.5 + half_log_tau));
         let doubled = u.with_empty_tape() * -2.0;
         let softplus = doubled.with_empty_tape().relu() + ((-doubled.abs()).exp() + 1.0).ln();
-        let squash = (-(u.with_empty_tape() + softplus) + std::f32::consts::LN_2) * 2.0;
-        let log_density = (gaussian - squash).sum::<(usize, usize), Axis<2>>();
-        debug_assert_eq!(*log_density.shape(), (members, batch));
-        (u.tanh(), log_density)
+        let squash = (-(u + softplus) + std::f32::consts::LN_2) * 2.0;
+        (action, (gaussian - squash).sum::<(usize, usize), Axis<2>>())
     }
 
     /// The action at the mean: what a policy does when it is judged.

@@ -5,6 +5,7 @@
 //! at the end `test.csv`, and `checkpoint/state.safetensors`, the one file that a resumed run starts
 //! from. Every file is written under a temporary name and renamed.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -91,6 +92,8 @@ struct Progress {
     episodes: Vec<EpisodeRow>,
     evaluations: Vec<EvaluationRow>,
     losses: Vec<LossRow>,
+    /// Sum and count of each loss since the last row of it.
+    pending: BTreeMap<String, (f32, usize)>,
 }
 
 /// What happened in a [`Run::step`].
@@ -117,7 +120,6 @@ pub struct Run {
     obs: Vec<f32>,
     episode_return: f64,
     episode_length: usize,
-    losses: Vec<(&'static str, f32, usize)>,
     evaluated_at: Option<usize>,
     clock: Instant,
     last_save: Instant,
@@ -129,6 +131,8 @@ impl Run {
     /// # Errors
     /// If the folder holds a run with other settings, a damaged checkpoint, or cannot be written.
     pub fn open(config: RunConfig, folder: &Path) -> Result<Self> {
+        // Whatever is wrong with the settings shows before anything is written.
+        let (mut agent, world) = (config.agent()?, config.world()?);
         let config_path = folder.join("config.toml");
         if config_path.exists() {
             let there = RunConfig::read(&config_path)?;
@@ -142,7 +146,6 @@ impl Run {
             let text = toml::to_string(&config).expect("a configuration is TOML");
             files::write(&config_path, text.as_bytes())?;
         }
-        let mut agent = config.agent()?;
         let checkpoint = folder.join("checkpoint").join("state.safetensors");
         let progress = if checkpoint.exists() {
             load(&checkpoint, agent.as_mut())?
@@ -151,13 +154,12 @@ impl Run {
         };
         let make = || config.world();
         let mut run = Self {
-            world: config.world()?,
+            world,
             judge: Judge::new(make)?,
             agent,
             obs: Vec::new(),
             episode_return: 0.0,
             episode_length: 0,
-            losses: Vec::new(),
             evaluated_at: progress.evaluations.last().map(|row| row.step),
             progress,
             folder: folder.into(),
@@ -248,20 +250,14 @@ impl Run {
     }
 
     fn note(&mut self, losses: crate::agent::Losses) {
+        let Progress { step, losses: rows, pending, .. } = &mut self.progress;
         for (name, value) in losses {
-            match self.losses.iter_mut().find(|(known, ..)| *known == name) {
-                Some((_, sum, count)) => (*sum, *count) = (*sum + value, *count + 1),
-                None => self.losses.push((name, value, 1)),
-            }
+            let (sum, count) = pending.entry(name.into()).or_default();
+            (*sum, *count) = (*sum + value, *count + 1);
         }
-        if self.progress.step.is_multiple_of(LOSSES_EVERY) {
-            let step = self.progress.step;
-            let means = self.losses.drain(..).map(|(name, sum, count)| LossRow {
-                step,
-                name: name.into(),
-                value: sum / count as f32,
-            });
-            self.progress.losses.extend(means);
+        if step.is_multiple_of(LOSSES_EVERY) {
+            let means = std::mem::take(pending).into_iter();
+            rows.extend(means.map(|(name, (sum, count))| LossRow { step: *step, name, value: sum / count as f32 }));
         }
     }
 

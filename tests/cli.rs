@@ -1,0 +1,163 @@
+//! The command line: what it makes, and how it answers bad input.
+
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+fn handful(folder: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_handful")).current_dir(folder).args(args).output().expect("the program starts")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// The command fails with exit code 2 and one or two lines that say all of `expected`.
+fn refused(folder: &Path, args: &[&str], expected: &[&str]) {
+    let output = handful(folder, args);
+    let said = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{args:?} said: {said}");
+    assert!(said.lines().count() <= 2, "{args:?} said too much: {said}");
+    for part in expected {
+        assert!(said.contains(part), "{args:?} did not say `{part}`, but: {said}");
+    }
+}
+
+#[test]
+fn bad_input_is_refused_in_one_line() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let train = |rest: &[&str]| -> Vec<String> {
+        ["train", "--task", "reach", "--method", "debug"].iter().chain(rest).map(ToString::to_string).collect()
+    };
+    let check = |args: Vec<String>, expected: &[&str]| {
+        refused(here, &args.iter().map(String::as_str).collect::<Vec<_>>(), expected);
+    };
+    refused(here, &["train", "--task", "raech", "--method", "sac"], &["unknown task `raech`", "`reach`"]);
+    refused(here, &["train", "--task", "reach", "--method", "sca"], &["unknown method `sca`", "`sac`"]);
+    refused(here, &["study", "--tasks", "lfit"], &["unknown task `lfit`", "`lift`"]);
+    refused(here, &["study", "--methods", "random,petz"], &["unknown method `petz`"]);
+    refused(here, &["study", "--seeds", "3..3"], &["no seeds", "3..3"]);
+    refused(here, &["study", "--seeds", "0"], &["no seeds"]);
+    refused(here, &["study", "--seeds", "few"], &["--seeds few"]);
+    refused(here, &["study", "--jobs", "0"], &["--jobs"]);
+    refused(here, &["study", "--tasks", "pendulum", "--methods", "scripted"], &["pendulum has no scripted policy"]);
+    refused(here, &["watch", "--task", "reach", "--policy", "scriptd"], &["unknown policy `scriptd`", "`scripted`"]);
+    refused(here, &["evaluate", "--run", "nowhere"], &["cannot read", "nowhere"]);
+    refused(here, &["report", "--from", "nowhere"], &["cannot read", "nowhere"]);
+
+    std::fs::write(here.join("typo.toml"), "[sac]\nlearning_rat = 1e-3\n").expect("a writable folder");
+    check(train(&["--config", "typo.toml"]), &["typo.toml", "unknown field `learning_rat`", "`learning_rate`"]);
+    std::fs::write(here.join("kind.toml"), "[sac]\nbatch = \"many\"\n").expect("a writable folder");
+    check(train(&["--config", "kind.toml"]), &["kind.toml", "many"]);
+    std::fs::write(here.join("zero.toml"), "[sac]\nbatch = 0\n").expect("a writable folder");
+    check(train(&["--config", "zero.toml"]), &["`batch` must be at least 1"]);
+    std::fs::write(here.join("broken.toml"), "[sac\n").expect("a writable folder");
+    check(train(&["--config", "broken.toml"]), &["broken.toml"]);
+    check(train(&["--config", "missing.toml"]), &["cannot read missing.toml"]);
+    // A folder that cannot be, because a file stands in its way.
+    check(train(&["--out", "typo.toml/run"]), &["cannot", "typo.toml"]);
+    assert!(!here.join("runs").exists(), "nothing was made");
+    assert_eq!(std::fs::read_to_string(here.join("typo.toml")).expect("still there"), "[sac]\nlearning_rat = 1e-3\n");
+}
+
+#[test]
+fn a_small_study_from_start_to_report() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let study = ["study", "--tasks", "reach", "--methods", "random,scripted,debug", "--seeds", "2", "--out", "study"];
+    let output = handful(here, &study);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let table = text(&output.stdout);
+    assert!(table.contains("scripted") && table.contains("100 % ["), "{table}");
+    for file in ["evaluations.csv", "tests.csv", "summary.csv", "report.md", "reach-learning.svg", "reach-test.svg"] {
+        assert!(here.join("study").join(file).metadata().expect(file).len() > 100, "{file}");
+    }
+    for file in ["config.toml", "episodes.csv", "evaluations.csv", "losses.csv", "test.csv", "summary.toml", "weights.safetensors"] {
+        assert!(here.join("study/reach/debug/seed1").join(file).exists(), "{file}");
+    }
+    let head = std::fs::read_to_string(here.join("study/reach/debug/seed0/evaluations.csv")).expect("evaluations");
+    assert_eq!(
+        head.lines().next(),
+        Some("step,episodes,success,return_mean,return_std,smoothness_sparc,smoothness_ldlj,action_ms")
+    );
+
+    // A second time, nothing is run again, and the table is the same.
+    let start = Instant::now();
+    let again = handful(here, &study);
+    assert!(again.status.success() && start.elapsed() < Duration::from_secs(10));
+    assert_eq!(text(&again.stdout), table);
+    assert!(!text(&again.stderr).contains("started"), "{}", text(&again.stderr));
+
+    // The report is made from the tables alone.
+    std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
+    let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);
+    assert!(report.status.success(), "{}", text(&report.stderr));
+    let [first, second] = ["study/report.md", "elsewhere/report.md"].map(|f| std::fs::read_to_string(here.join(f)).expect(f));
+    assert_eq!(first, second);
+}
+
+#[test]
+fn train_evaluate_and_watch() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let output = handful(here, &["train", "--task", "push", "--method", "debug", "--steps", "300", "--out", "run"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let output = handful(here, &["evaluate", "--run", "run", "--episodes", "3", "--seed", "1", "--json"]);
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(summary["episodes"], 3);
+    assert!(summary["return_mean"].is_number() && summary["smoothness_sparc"].is_number(), "{summary}");
+    refused(here, &["evaluate", "--run", "run", "--episodes", "0"], &["at least one episode"]);
+
+    let output = handful(here, &["watch", "--run", "run", "--seed", "2"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let page = std::fs::read_to_string(here.join("run/watch.html")).expect("a page");
+    assert!(page.contains("push, debug, seed 2") && !page.contains("{{"));
+    let json = page.split_once("id=\"recording\">").and_then(|(_, rest)| rest.split_once("</script>"));
+    let recording: serde_json::Value = serde_json::from_str(json.expect("a recording").0).expect("JSON");
+    let (bodies, frames) = (recording["bodies"].as_array().expect("bodies"), recording["frames"].as_array().expect("frames"));
+    assert_eq!(frames.len(), 151);
+    assert!(frames.iter().all(|frame| frame["poses"].as_array().is_some_and(|poses| poses.len() == bodies.len())));
+
+    // A checkpoint that is not one of ours.
+    std::fs::write(here.join("run/weights.safetensors"), b"something else").expect("a writable folder");
+    refused(here, &["evaluate", "--run", "run"], &["weights.safetensors", "damaged"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_leaves_a_run_that_resumes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let train = ["train", "--task", "reach", "--method", "debug", "--steps", "20000", "--out", "run"];
+    let child = Command::new(env!("CARGO_BIN_EXE_handful"))
+        .current_dir(here)
+        .args(train)
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("the program starts");
+    std::thread::sleep(Duration::from_secs(4));
+    let kill = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    assert!(kill.success());
+    let output = child.wait_with_output().expect("the program ends");
+    let said = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(130), "{said}");
+    assert!(said.contains("the same command resumes it"), "{said}");
+    let episodes = std::fs::read_to_string(here.join("run/episodes.csv")).expect("episodes");
+    let done = episodes.lines().count() - 1;
+    assert!(done > 0, "{said}");
+
+    // Going on for a moment is enough to see that it starts from there.
+    let mut child = Command::new(env!("CARGO_BIN_EXE_handful"))
+        .current_dir(here)
+        .args(train)
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("the program starts");
+    std::thread::sleep(Duration::from_secs(2));
+    child.kill().expect("it still runs");
+    let said = text(&child.wait_with_output().expect("the program ends").stderr);
+    assert!(said.contains(&format!("going on after {} steps", 100 * done)), "{said}");
+}

@@ -1,0 +1,152 @@
+//! Agents learn what they should, and a run that was stopped goes on as if it had not been.
+
+use std::path::Path;
+
+use handful::agent::{Agent, Mode, Sac, SacConfig};
+use handful::env::{Env, Task};
+use handful::error::Error;
+use handful::replay::{ReplayBuffer, Transition};
+use handful::rng;
+use handful::study::config::RunConfig;
+use handful::study::evaluate::{Judge, Starts};
+use handful::study::run::{Event, Run, is_complete, trained_agent};
+
+/// Random torques bring about -1200; the best possible is about -135.
+#[test]
+fn sac_swings_the_pendulum_up() {
+    let mut env = Task::Pendulum.make();
+    let config = SacConfig {
+        hidden: vec![64, 64],
+        batch: 128,
+        learning_rate: 2e-3,
+        temperature_rate: 2e-3,
+        ..SacConfig::default()
+    };
+    let mut agent = Sac::new(env.spec(), config, 0).expect("usable settings");
+    let mut obs = env.reset(0);
+    for step in 1..=6_000_u64 {
+        let action = agent.act(&obs, Mode::Explore);
+        let outcome = env.step(&action).expect("a valid action");
+        agent.observe(&Transition {
+            obs,
+            action,
+            reward: outcome.reward,
+            next_obs: outcome.observation.clone(),
+            terminated: outcome.terminated,
+            truncated: outcome.truncated,
+        });
+        agent.update();
+        obs = if outcome.done() { env.reset(step) } else { outcome.observation };
+    }
+    let mut judge = Judge::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
+    let summary = judge.evaluate(&mut agent, 20, Starts::Test).expect("valid actions").summary();
+    assert!(summary.return_mean > -250.0, "mean return {}", summary.return_mean);
+}
+
+fn transition(number: f32, truncated: bool) -> Transition {
+    Transition {
+        obs: vec![number, 0.0],
+        action: vec![0.5],
+        reward: number,
+        next_obs: vec![number + 1.0, 0.0],
+        terminated: false,
+        truncated,
+    }
+}
+
+#[test]
+fn the_replay_buffer_is_a_ring_and_keeps_truncated_futures() {
+    let mut buffer = ReplayBuffer::new(2, 1, 10);
+    (0..25).for_each(|i| buffer.push(&transition(i as f32, i % 5 == 4)));
+    assert_eq!(buffer.len(), 10);
+    let batch = buffer.sample(500, &mut rng::stream(0, "replay"));
+    let mut seen: Vec<i32> = batch.rewards.iter().map(|r| *r as i32).collect();
+    seen.sort_unstable();
+    seen.dedup();
+    assert_eq!(seen, (15..25).collect::<Vec<i32>>(), "the last ten, and all of them");
+    for i in 0..500 {
+        assert_eq!(batch.next_obs[2 * i], batch.obs[2 * i] + 1.0, "the observation after the very same step");
+        assert_eq!(batch.terminated[i], 0.0, "an end by the clock is no end");
+    }
+}
+
+fn debug_run(seed: u64) -> RunConfig {
+    RunConfig::new(Task::Reach, "debug", seed, None, None).expect("a preset")
+}
+
+fn finish(run: &mut Run) {
+    while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
+}
+
+/// A CSV without its columns of wall-clock times.
+fn without_times(path: &Path) -> String {
+    let text = std::fs::read_to_string(path).expect("a file of the run");
+    let head: Vec<&str> = text.lines().next().expect("a header").split(',').collect();
+    let kept = |line: &str| -> String {
+        let cells = line.split(',').zip(&head).filter(|(_, name)| !["seconds", "action_ms"].contains(name));
+        cells.map(|(cell, _)| cell).collect::<Vec<_>>().join(",")
+    };
+    text.lines().map(kept).collect::<Vec<_>>().join("\n")
+}
+
+#[test]
+fn a_resumed_run_ends_as_if_it_had_never_stopped() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
+    finish(&mut Run::open(debug_run(1), &whole).expect("a new run"));
+    {
+        let mut run = Run::open(debug_run(1), &halves).expect("a new run");
+        while run.steps_done() < 300 || !run.between_episodes() {
+            run.step().expect("a healthy run");
+        }
+        run.save().expect("a writable folder");
+        // What happens after the save is lost, as in a crash.
+        (0..150).for_each(|_| drop(run.step().expect("a healthy run")));
+    }
+    let mut run = Run::open(debug_run(1), &halves).expect("a run to go on with");
+    assert_eq!(run.steps_done(), 300);
+    finish(&mut run);
+    for file in ["episodes.csv", "evaluations.csv", "losses.csv", "test.csv"] {
+        assert_eq!(without_times(&whole.join(file)), without_times(&halves.join(file)), "{file}");
+    }
+    let bytes = |folder: &Path| std::fs::read(folder.join("weights.safetensors")).expect("weights");
+    assert!(bytes(&whole) == bytes(&halves), "the same weights to the last bit");
+    assert!(is_complete(&whole) && is_complete(&halves));
+}
+
+#[test]
+fn a_trained_agent_comes_back_from_its_folder() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut run = Run::open(debug_run(2), folder.path()).expect("a new run");
+    finish(&mut run);
+    let (config, mut agent) = trained_agent(folder.path()).expect("a complete run");
+    assert_eq!(config, debug_run(2));
+    let mut judge = Judge::new(|| config.world()).expect("a world");
+    let again = judge.evaluate(agent.as_mut(), config.test_episodes, Starts::Test).expect("valid actions");
+    let tested = std::fs::read_to_string(folder.path().join("summary.toml")).expect("a summary");
+    let tested: toml::Table = toml::from_str(&tested).expect("TOML");
+    assert_eq!(tested["return_mean"].as_float(), Some(again.summary().return_mean));
+}
+
+#[test]
+fn a_folder_with_another_run_is_left_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    drop(Run::open(debug_run(3), folder.path()).expect("a new run"));
+    let before = std::fs::read(folder.path().join("config.toml")).expect("a config");
+    let Err(problem) = Run::open(debug_run(4), folder.path()) else { panic!("another seed is another run") };
+    assert!(problem.to_string().contains("`seed` is 3, not 4"), "{problem}");
+    assert_eq!(std::fs::read(folder.path().join("config.toml")).expect("a config"), before);
+}
+
+#[test]
+fn a_damaged_checkpoint_is_named_and_kept() {
+    let folder = tempfile::tempdir().expect("a folder");
+    finish(&mut Run::open(debug_run(5), folder.path()).expect("a new run"));
+    let checkpoint = folder.path().join("checkpoint/state.safetensors");
+    let whole = std::fs::read(&checkpoint).expect("a checkpoint");
+    std::fs::write(&checkpoint, &whole[..whole.len() / 2]).expect("a writable folder");
+    let Err(problem) = Run::open(debug_run(5), folder.path()) else { panic!("half a checkpoint is none") };
+    assert!(matches!(problem, Error::BadFile { .. }), "{problem}");
+    assert!(problem.to_string().contains("state.safetensors"), "{problem}");
+    assert_eq!(std::fs::read(&checkpoint).expect("still there").len(), whole.len() / 2);
+}

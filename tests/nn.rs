@@ -1,0 +1,308 @@
+//! The learning core: gradients against finite differences, distributions and optimiser against
+//! numbers computed elsewhere in float64 (with numpy, scipy and PyTorch).
+
+use dfdx::prelude::*;
+use handful::nn::kernels::{self, DenseShape, Matrix};
+use handful::nn::{
+    Activation, Adam, AdamConfig, Learning, Mlp, MlpConfig, Parameters, SquashedGaussian, Tensor3, Weights, copy_parameters,
+    device, ops, polyak, tensor, values,
+};
+use handful::rng::{self, Rng};
+
+fn numbers(count: usize, rng: &mut Rng) -> Vec<f32> {
+    (0..count).map(|_| rng::normal(rng) as f32).collect()
+}
+
+fn random(shape: (usize, usize, usize), rng: &mut Rng) -> Tensor3 {
+    tensor(&device(), numbers(shape.0 * shape.1 * shape.2, rng), shape)
+}
+
+fn near(what: &str, ours: f32, theirs: f64, tolerance: f64) {
+    assert!((f64::from(ours) - theirs).abs() <= tolerance * theirs.abs().max(1.0), "{what}: {ours}, expected {theirs}");
+}
+
+/// Checks the gradient of `loss` (a function of several tensors) against central differences, for a
+/// sample of the numbers of each tensor.
+fn check_gradients(
+    inputs: Vec<Tensor3>,
+    loss: impl Fn(&[Tensor3], bool) -> (f32, Option<dfdx::tensor::Gradients<f32, Cpu>>),
+) {
+    const H: f32 = 2e-2;
+    let (_, gradients) = loss(&inputs, true);
+    let mut gradients = gradients.expect("a taped loss has gradients");
+    for (which, input) in inputs.iter().enumerate() {
+        let exact = gradients.get_or_alloc_mut(input).expect("memory").to_vec();
+        let count = exact.len();
+        for at in (0..count).step_by(count.div_ceil(11)) {
+            let moved = |by: f32| {
+                let mut inputs = inputs.clone();
+                let mut numbers = values(&inputs[which]).to_vec();
+                numbers[at] += by;
+                inputs[which].copy_from(&numbers);
+                f64::from(loss(&inputs, false).0)
+            };
+            let difference = (moved(H) - moved(-H)) / f64::from(2.0 * H);
+            let scale = exact.iter().fold(0.0_f32, |a, g| a.max(g.abs()));
+            let error = (f64::from(exact[at]) - difference).abs() / f64::from(scale.max(1e-3));
+            assert!(error < 2e-2, "input {which}, number {at}: {} by the tape, {difference} by differences", exact[at]);
+        }
+    }
+}
+
+/// A smooth scalar of a tensor that treats every number differently.
+fn scalar<T: Tape<f32, Cpu>>(y: Tensor3<T>, weights: &Tensor3) -> Tensor<Rank0, f32, Cpu, T> {
+    (y.sin() * weights.clone()).sum()
+}
+
+#[test]
+fn matmul_reads_transposed_matrices() {
+    // [[1, 2, 3], [4, 5, 6]] and its transposed.
+    let a = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+    let mut square = [0.0; 4];
+    kernels::matmul(&mut square, Matrix::new(&a, 3), Matrix::new(&a, 3).t(), false);
+    assert_eq!(square, [14.0, 32.0, 32.0, 77.0]);
+    let mut outer = [1.0; 9];
+    kernels::matmul(&mut outer, Matrix::new(&a, 3).t(), Matrix::new(&a, 3), true);
+    assert_eq!(outer, [18.0, 23.0, 28.0, 23.0, 30.0, 37.0, 28.0, 37.0, 46.0]);
+}
+
+#[test]
+fn a_layer_does_not_depend_on_the_number_of_threads() {
+    let mut rng = rng::stream(0, "threads");
+    let shape = DenseShape { members: 1, batch: 301, input: 77, output: 129, shared_input: true };
+    let (x, w, b) = (numbers(301 * 77, &mut rng), numbers(77 * 129, &mut rng), numbers(129, &mut rng));
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+        pool.install(|| {
+            let (mut y, mut dx) = (vec![0.0; 301 * 129], vec![0.0; 301 * 77]);
+            let (mut dw, mut db) = (vec![0.0; 77 * 129], vec![0.0; 129]);
+            kernels::dense(&mut y, &x, &w, &b, shape, Activation::Relu);
+            kernels::dense_input_gradient(&mut dx, &y, &w, shape);
+            kernels::dense_parameter_gradients(&mut dw, &mut db, &x, &y, shape);
+            [y, dx, dw, db].concat().iter().map(|v: &f32| v.to_bits()).collect::<Vec<u32>>()
+        })
+    };
+    assert_eq!(with(1), with(2));
+    assert_eq!(with(1), with(5));
+}
+
+#[test]
+fn gradients_of_a_dense_layer() {
+    let mut rng = rng::stream(1, "dense");
+    for (x_members, activation) in [(1, Activation::Identity), (3, Activation::Identity), (3, Activation::Relu)] {
+        let inputs =
+            vec![random((x_members, 7, 5), &mut rng), random((3, 5, 4), &mut rng), random((3, 1, 4), &mut rng)];
+        let weights = random((3, 7, 4), &mut rng);
+        check_gradients(inputs, |inputs, taped| {
+            let [x, w, b] = inputs else { unreachable!() };
+            if taped {
+                let y = ops::dense(x.clone().leaky_traced(), w, b, activation, Learning::Trained);
+                let loss = scalar(y, &weights);
+                (loss.array(), Some(loss.backward()))
+            } else {
+                (scalar(ops::dense(x.clone(), w, b, activation, Learning::Trained), &weights).array(), None)
+            }
+        });
+    }
+}
+
+#[test]
+fn gradients_of_layer_normalisation() {
+    let mut rng = rng::stream(2, "norm");
+    let inputs = vec![random((2, 6, 9), &mut rng), random((2, 1, 9), &mut rng), random((2, 1, 9), &mut rng)];
+    let weights = random((2, 6, 9), &mut rng);
+    check_gradients(inputs, |inputs, taped| {
+        let [x, gain, shift] = inputs else { unreachable!() };
+        let identity = Activation::Identity;
+        if taped {
+            let y = ops::layer_norm(x.clone().leaky_traced(), gain, shift, identity, Learning::Trained);
+            let loss = scalar(y, &weights);
+            (loss.array(), Some(loss.backward()))
+        } else {
+            (scalar(ops::layer_norm(x.clone(), gain, shift, identity, Learning::Trained), &weights).array(), None)
+        }
+    });
+}
+
+#[test]
+fn gradients_of_joining() {
+    let mut rng = rng::stream(3, "join");
+    let inputs = vec![random((2, 4, 3), &mut rng), random((2, 4, 2), &mut rng)];
+    let weights = random((2, 4, 5), &mut rng);
+    check_gradients(inputs, |inputs, taped| {
+        let [a, b] = inputs else { unreachable!() };
+        if taped {
+            let loss = scalar(ops::join(a.clone().leaky_traced(), b.clone()), &weights);
+            (loss.array(), Some(loss.backward()))
+        } else {
+            (scalar(ops::join(a.clone(), b.clone()), &weights).array(), None)
+        }
+    });
+}
+
+#[test]
+fn frozen_parameters_get_no_gradient() {
+    let mut rng = rng::stream(4, "frozen");
+    let (x, w, b) = (random((1, 7, 5), &mut rng), random((2, 5, 4), &mut rng), random((2, 1, 4), &mut rng));
+    let y = ops::dense(x.clone().leaky_traced(), &w, &b, Activation::Relu, Learning::Frozen);
+    let mut gradients = y.square().sum::<Rank0, _>().backward();
+    assert!(gradients.get_or_alloc_mut(&w).expect("memory").iter().all(|g| *g == 0.0));
+    assert!(gradients.get_or_alloc_mut(&b).expect("memory").iter().all(|g| *g == 0.0));
+    assert!(gradients.get_or_alloc_mut(&x).expect("memory").iter().any(|g| *g != 0.0));
+}
+
+/// mu = [0.3, -1.2], log std = [-0.5, 0.2], eps = [0.7, -1.5].
+#[test]
+fn the_squashed_gaussian_has_the_right_density() {
+    let cpu = device();
+    let mean = tensor(&cpu, vec![0.3, -1.2], (1, 1, 2));
+    let log_std = tensor(&cpu, vec![-0.5, 0.2], (1, 1, 2));
+    let noise = tensor(&cpu, vec![0.7, -1.5], (1, 1, 2));
+    let distribution = SquashedGaussian { mean: mean.leaky_trace(), log_std: log_std.leaky_trace() };
+    let (action, log_density) = distribution.sample(noise);
+    near("action", values(&action)[0], 0.619_732_99, 1e-6);
+    near("action", values(&action)[1], -0.995_361_59, 1e-6);
+    near("log density", log_density.as_vec()[0], 2.259_300_94, 1e-5);
+    let mut gradients = log_density.sum::<Rank0, _>().backward();
+    let mut check = |of: &Tensor3, expected: [f64; 2]| {
+        let found = gradients.get_or_alloc_mut(of).expect("memory").to_vec();
+        found.iter().zip(expected).for_each(|(g, e)| near("gradient", *g, e, 1e-5));
+    };
+    check(&mean, [1.239_465_98, -1.990_723_17]);
+    check(&log_std, [-0.473_758_12, 2.647_212_16]);
+}
+
+/// ln(1 - tanh(u)^2), where the form ln(1 - a^2 + 1e-6) has long saturated.
+#[test]
+fn the_density_is_exact_far_out() {
+    let cpu = device();
+    for (u, expected) in [(0.0, 0.0), (1.0, -0.867_561_66), (-3.0, -4.618_657_01), (8.0, -14.613_705_86), (20.0, -38.613_705_64), (-20.0, -38.613_705_64)] {
+        // With std = 1 and eps = 0 the Gaussian part is -ln(2 pi) / 2.
+        let zero = tensor(&cpu, vec![0.0], (1, 1, 1));
+        let mean = tensor(&cpu, vec![u], (1, 1, 1));
+        let (_, log_density) = SquashedGaussian { mean, log_std: zero.clone() }.sample(zero);
+        let squash = -0.5 * (2.0 * std::f64::consts::PI).ln() - f64::from(log_density.as_vec()[0]);
+        near(&format!("u = {u}"), squash as f32, expected, 2e-6);
+    }
+}
+
+#[test]
+fn log_std_stays_in_its_range_with_a_gradient() {
+    let head = tensor(&device(), vec![0.0, 0.0, -2.0, 2.0], (1, 1, 4));
+    let distribution = SquashedGaussian::from_head(head.leaky_trace());
+    let log_std = values(&distribution.log_std).to_vec();
+    assert!(log_std.iter().all(|x| (-5.0..=2.0).contains(x)), "{log_std:?}");
+    let mut gradients = distribution.log_std.sum::<Rank0, _>().backward();
+    let gradient = gradients.get_or_alloc_mut(&head).expect("memory").to_vec();
+    assert!(gradient[2] > 0.1 && gradient[3] > 0.1 && gradient[..2] == [0.0; 2], "{gradient:?}");
+}
+
+fn network(members: usize, layer_norm: bool, seed: u64) -> Mlp {
+    let config = MlpConfig { members, input: 3, hidden: vec![16, 16], output: 2, layer_norm };
+    Mlp::new(&device(), &config, &mut rng::stream(seed, "network"))
+}
+
+/// One member of several is the same network as it would be alone.
+#[test]
+fn members_do_not_mix() {
+    let both = network(2, true, 0);
+    let x = random((1, 5, 3), &mut rng::stream(5, "x"));
+    let y = both.forward(x.clone(), Learning::Frozen);
+    let mut alone = network(1, true, 1);
+    for member in 0..2 {
+        for ((_, mine), (_, ours)) in alone.parameters_mut().into_iter().zip(both.parameters()) {
+            let size = values(ours).len() / 2;
+            mine.copy_from(&values(ours)[member * size..][..size]);
+        }
+        let own = alone.forward(x.clone(), Learning::Frozen);
+        assert_eq!(values(&own), &values(&y)[member * 10..][..10]);
+    }
+}
+
+/// Adam against PyTorch's formula, spelt out for one number over three steps.
+#[test]
+fn adam_steps_as_in_the_paper() {
+    let mut module = network(1, false, 2);
+    let start = values(module.parameters()[0].1)[0];
+    let mut adam = Adam::new(AdamConfig::new(1e-2));
+    let (mut m, mut v, mut expected) = (0.0, 0.0, f64::from(start));
+    for (t, g) in [(1, 0.5), (2, -0.2), (3, 0.05)] {
+        let mut gradients = dfdx::tensor::Gradients::leaky();
+        for (_, parameter) in module.parameters() {
+            gradients.get_or_alloc_mut(parameter).expect("memory").fill(g as f32);
+        }
+        adam.step(&mut module, &mut gradients);
+        m = 0.9 * m + 0.1 * g;
+        v = 0.999 * v + 0.001 * g * g;
+        expected -= 1e-2 * (m / (1.0 - 0.9_f64.powi(t))) / ((v / (1.0 - 0.999_f64.powi(t))).sqrt() + 1e-8);
+        near("parameter", values(module.parameters()[0].1)[0], expected, 1e-6);
+    }
+}
+
+#[test]
+fn clipping_scales_the_whole_gradient() {
+    let mut module = network(1, false, 3);
+    let config = AdamConfig { max_norm: Some(1.0), epsilon: 1.0, ..AdamConfig::new(1.0) };
+    let mut gradients = dfdx::tensor::Gradients::leaky();
+    let mut count = 0;
+    for (_, parameter) in module.parameters() {
+        let gradient = gradients.get_or_alloc_mut(parameter).expect("memory");
+        gradient.fill(2.0);
+        count += gradient.len();
+    }
+    let before = values(module.parameters()[0].1)[0];
+    let norm = Adam::new(config).step(&mut module, &mut gradients);
+    near("norm", norm, 2.0 * (count as f64).sqrt(), 1e-5);
+    // With epsilon 1, the first step is g / (|g| + 1).
+    let clipped = 1.0 / (count as f64).sqrt();
+    near("step", before - values(module.parameters()[0].1)[0], clipped / (clipped + 1.0), 1e-4);
+}
+
+#[test]
+fn targets_follow_by_polyak() {
+    let (mut target, mut source) = (network(1, false, 4), network(1, false, 5));
+    target.parameters_mut().into_iter().for_each(|(_, p)| p.copy_from(&vec![1.0; values(p).len()]));
+    source.parameters_mut().into_iter().for_each(|(_, p)| p.copy_from(&vec![2.0; values(p).len()]));
+    polyak(&mut target, &source, 0.005);
+    near("one step", values(target.parameters()[0].1)[0], 1.005, 1e-6);
+    (1..100).for_each(|_| polyak(&mut target, &source, 0.005));
+    near("a hundred steps", values(target.parameters()[0].1)[0], 1.394_229_56, 1e-5);
+    copy_parameters(&mut target, &source);
+    assert_eq!(values(target.parameters()[0].1)[0], 2.0);
+}
+
+#[test]
+fn weights_survive_a_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("deep/weights.safetensors");
+    let (saved, mut loaded) = (network(2, true, 6), network(2, true, 7));
+    let mut weights = Weights::default();
+    weights.insert_module("critics", &saved);
+    weights.insert_counts("counts", &[u64::MAX, 0, 123_456_789_012_345]);
+    weights.set_note("progress", "{}".into());
+    weights.write(&path).expect("a writable folder");
+    let read = Weights::read(&path).expect("what was just written");
+    read.load_module("critics", &mut loaded).expect("the same shapes");
+    for ((_, a), (_, b)) in saved.parameters().iter().zip(loaded.parameters()) {
+        assert_eq!(values(a), values(b));
+    }
+    assert_eq!(read.counts("counts", 3).expect("three"), [u64::MAX, 0, 123_456_789_012_345]);
+    assert_eq!(read.note("progress"), Some("{}"));
+}
+
+#[test]
+fn foreign_weights_are_refused_and_change_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("weights.safetensors");
+    std::fs::write(&path, b"no weights at all").expect("a writable folder");
+    let problem = Weights::read(&path).expect_err("a damaged file").to_string();
+    assert!(problem.contains("weights.safetensors") && problem.contains("damaged"), "{problem}");
+    // Another shape.
+    let mut weights = Weights::default();
+    weights.insert_module("critics", &network(2, false, 8));
+    let mut other = network(1, false, 9);
+    let before = values(other.parameters()[0].1).to_vec();
+    let problem = weights.load_module("critics", &mut other).expect_err("other shapes").to_string();
+    assert!(problem.contains("critics.0.weight"), "{problem}");
+    assert_eq!(values(other.parameters()[0].1), before);
+}
