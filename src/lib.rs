@@ -1,3 +1,65 @@
+//! Model-based reinforcement learning in Rust, on a robot arm that has to move things with its hand.
+//!
+//! A map of the house. A floor uses only the floors below it.
+//!
+//! | floor | module | what lives there |
+//! | --- | --- | --- |
+//! | 3 | [`study`] | runs, the protocol by which agents are judged, tables, figures, reports |
+//! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
+//! | 2 | [`agent`] | agents: the wiring of what stands below |
+//! | 1 | [`replay`] | what was experienced |
+//! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
+//! | 0 | [`env`](mod@env) | worlds to act in: the arm at its table, pendulum, cart-pole |
+//! | 0 | [`rng`], [`files`], [`error`] | random numbers, files that are written whole, what can go wrong |
+//!
+//! What holds everywhere:
+//! - Agents know an environment by the trait [`env::Env`] alone; so does the study.
+//! - No global state: every random number comes from a generator that was passed in, and one seed
+//!   fixes a run bit for bit on one machine.
+//! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
+//! - Libraries return [`error::Error`]s; a panic is a bug.
+//!
+//! # An agent on an environment of your own
+//!
+//! ```
+//! use handful::prelude::*;
+//!
+//! /// A point on a line that has to come to zero.
+//! struct Line { spec: Spec, x: f32, elapsed: usize }
+//!
+//! impl Env for Line {
+//!     fn spec(&self) -> &Spec { &self.spec }
+//!     fn reset(&mut self, seed: u64) -> Vec<f32> {
+//!         (self.x, self.elapsed) = (seed as f32 % 3.0 - 1.0, 0);
+//!         vec![self.x]
+//!     }
+//!     fn step(&mut self, action: &[f32]) -> Result<Step> {
+//!         self.spec.check_action(action)?;
+//!         self.x += 0.2 * action[0].clamp(-1.0, 1.0);
+//!         self.elapsed += 1;
+//!         let success = self.x.abs() < 0.1;
+//!         Ok(Step { observation: vec![self.x], reward: -self.x.abs(), terminated: false,
+//!                   truncated: self.elapsed >= self.spec.horizon, success, stage: 0 })
+//!     }
+//! }
+//!
+//! let spec = Spec { name: "line".into(), observation: vec![Feature::new("x")], action_size: 1,
+//!                   horizon: 20, dt: 0.1, stages: vec![] };
+//! let mut env = Line { spec, x: 0.0, elapsed: 0 };
+//! let config = SacConfig { hidden: vec![32], warm_up: 100, ..SacConfig::default() };
+//! let mut agent = Sac::new(env.spec(), config, 0)?;
+//! let mut obs = env.reset(0);
+//! for i in 1..=300 {
+//!     let action = agent.act(&obs, Mode::Explore);
+//!     let Step { observation, reward, terminated, truncated, .. } = env.step(&action)?;
+//!     agent.observe(&Transition { obs, action, reward, next_obs: observation.clone(), terminated, truncated });
+//!     agent.update();
+//!     obs = if terminated || truncated { env.reset(i) } else { observation };
+//! }
+//! # Ok::<(), handful::error::Error>(())
+//! ```
+#![warn(missing_docs)]
+
 pub mod agent;
 pub mod env;
 pub mod error;
@@ -7,3 +69,14 @@ pub mod replay;
 pub mod rng;
 pub mod study;
 pub mod watch;
+
+/// What most programs that use this crate need.
+pub mod prelude {
+    pub use crate::agent::{Agent, Losses, Mode, Random, Sac, SacConfig, Scripted};
+    pub use crate::env::tabletop::TableOptions;
+    pub use crate::env::vector::VectorEnv;
+    pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};
+    pub use crate::error::{Error, Result};
+    pub use crate::replay::{ReplayBuffer, Transition};
+    pub use crate::study::evaluate::{Judge, Starts};
+}

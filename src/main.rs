@@ -249,9 +249,8 @@ fn report(_from: &Path, _to: &Path) -> Result<()> {
 fn train(args: TrainArgs, stop: &AtomicBool) -> Result<()> {
     let task: Task = args.task.parse()?;
     let config = RunConfig::new(task, &args.method, args.seed, args.steps, args.config.as_deref())?;
-    let folder = args
-        .out
-        .unwrap_or_else(|| Path::new("runs").join(format!("{task}-{}-seed{}", args.method, args.seed)));
+    let folder =
+        args.out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{}-seed{}", args.method, args.seed)));
     if run::is_complete(&folder) && RunConfig::read(&folder.join("config.toml"))? == config {
         println!("this run is complete: {}", folder.display());
         return print_test(&folder);

@@ -9,9 +9,9 @@ pub type Rng = rand_xoshiro::Xoshiro256PlusPlus;
 /// streams, so that drawing more numbers for one never changes another.
 pub fn stream(seed: u64, purpose: &str) -> Rng {
     // FNV-1a: a hash that will be the same in every version of this crate.
-    let hash = purpose.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
-    });
+    let hash = purpose
+        .bytes()
+        .fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
     Rng::seed_from_u64(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ hash)
 }
 

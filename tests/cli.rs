@@ -73,7 +73,15 @@ fn a_small_study_from_start_to_report() {
     for file in ["evaluations.csv", "tests.csv", "summary.csv", "report.md", "reach-learning.svg", "reach-test.svg"] {
         assert!(here.join("study").join(file).metadata().expect(file).len() > 100, "{file}");
     }
-    for file in ["config.toml", "episodes.csv", "evaluations.csv", "losses.csv", "test.csv", "summary.toml", "weights.safetensors"] {
+    for file in [
+        "config.toml",
+        "episodes.csv",
+        "evaluations.csv",
+        "losses.csv",
+        "test.csv",
+        "summary.toml",
+        "weights.safetensors",
+    ] {
         assert!(here.join("study/reach/debug/seed1").join(file).exists(), "{file}");
     }
     let head = std::fs::read_to_string(here.join("study/reach/debug/seed0/evaluations.csv")).expect("evaluations");
@@ -93,7 +101,8 @@ fn a_small_study_from_start_to_report() {
     std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
     let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);
     assert!(report.status.success(), "{}", text(&report.stderr));
-    let [first, second] = ["study/report.md", "elsewhere/report.md"].map(|f| std::fs::read_to_string(here.join(f)).expect(f));
+    let [first, second] =
+        ["study/report.md", "elsewhere/report.md"].map(|f| std::fs::read_to_string(here.join(f)).expect(f));
     assert_eq!(first, second);
 }
 
@@ -115,7 +124,8 @@ fn train_evaluate_and_watch() {
     assert!(page.contains("push, debug, seed 2") && !page.contains("{{"));
     let json = page.split_once("id=\"recording\">").and_then(|(_, rest)| rest.split_once("</script>"));
     let recording: serde_json::Value = serde_json::from_str(json.expect("a recording").0).expect("JSON");
-    let (bodies, frames) = (recording["bodies"].as_array().expect("bodies"), recording["frames"].as_array().expect("frames"));
+    let (bodies, frames) =
+        (recording["bodies"].as_array().expect("bodies"), recording["frames"].as_array().expect("frames"));
     assert_eq!(frames.len(), 151);
     assert!(frames.iter().all(|frame| frame["poses"].as_array().is_some_and(|poses| poses.len() == bodies.len())));
 

@@ -4,8 +4,8 @@
 use dfdx::prelude::*;
 use handful::nn::kernels::{self, DenseShape, Matrix};
 use handful::nn::{
-    Activation, Adam, AdamConfig, Learning, Mlp, MlpConfig, Parameters, SquashedGaussian, Tensor3, Weights, copy_parameters,
-    device, ops, polyak, tensor, values,
+    Activation, Adam, AdamConfig, Learning, Mlp, MlpConfig, Parameters, SquashedGaussian, Tensor3, Weights,
+    copy_parameters, device, ops, polyak, tensor, values,
 };
 use handful::rng::{self, Rng};
 
@@ -176,7 +176,14 @@ fn the_squashed_gaussian_has_the_right_density() {
 #[test]
 fn the_density_is_exact_far_out() {
     let cpu = device();
-    for (u, expected) in [(0.0, 0.0), (1.0, -0.867_561_66), (-3.0, -4.618_657_01), (8.0, -14.613_705_86), (20.0, -38.613_705_64), (-20.0, -38.613_705_64)] {
+    for (u, expected) in [
+        (0.0, 0.0),
+        (1.0, -0.867_561_66),
+        (-3.0, -4.618_657_01),
+        (8.0, -14.613_705_86),
+        (20.0, -38.613_705_64),
+        (-20.0, -38.613_705_64),
+    ] {
         // With std = 1 and eps = 0 the Gaussian part is -ln(2 pi) / 2.
         let zero = tensor(&cpu, vec![0.0], (1, 1, 1));
         let mean = tensor(&cpu, vec![u], (1, 1, 1));

@@ -137,7 +137,11 @@ fn the_engine_accelerates_as_the_equations_say() {
             let (link, timestep) = (&arm.links[j], handful::env::physics::TIMESTEP);
             (link.armature * before.qd[j] / timestep + torques[j]).clamp(-link.friction, link.friction)
         });
-        let expected = at.mass.cholesky().expect("positive definite").solve(&(torques - at.coriolis(&before.qd) - damping - friction));
+        let expected = at
+            .mass
+            .cholesky()
+            .expect("positive definite")
+            .solve(&(torques - at.coriolis(&before.qd) - damping - friction));
         let found = (after.qd - before.qd) / handful::env::physics::TIMESTEP;
         worst = worst.max((found - expected).amax());
     }

@@ -1,8 +1,8 @@
 //! Smoothness and statistics against numbers computed elsewhere in float64.
 
+use handful::env::pendulum::PendulumState;
 use handful::study::smoothness::{ldlj, of_path, sparc};
 use handful::study::statistics::{area_under_curve, bootstrap, interquartile_mean, steps_to, wilson};
-use handful::env::pendulum::PendulumState;
 use handful::{env::cartpole::CartPoleState, rng};
 
 fn near(what: &str, ours: f64, theirs: f64, tolerance: f64) {
@@ -39,7 +39,11 @@ fn smoothness_of_known_movements() {
         near("minimum jerk: LDLJ", ldlj(&along_x(&speed), rate), jerk, 1e-7);
     }
     // Tremor of 8 Hz: small ones stay below SPARC's threshold, LDLJ sees them all.
-    for (tremor, spectral, jerk) in [(0.05, -1.405_810_30, -7.762_338_84), (0.15, -1.878_165_32, -9.781_943_52), (0.30, -2.004_585_34, -11.017_236_94)] {
+    for (tremor, spectral, jerk) in [
+        (0.05, -1.405_810_30, -7.762_338_84),
+        (0.15, -1.878_165_32, -9.781_943_52),
+        (0.30, -2.004_585_34, -11.017_236_94),
+    ] {
         let smooth = minimum_jerk(1.0, 1.0, 100.0);
         let shaking = |(i, v): (usize, &f64)| v + tremor * (std::f64::consts::TAU * 8.0 * i as f64 / 100.0).sin();
         let speed: Vec<f64> = smooth.iter().enumerate().map(shaking).collect();

@@ -225,7 +225,8 @@ fn options_change_what_they_say() {
         obs = step.observation;
     }
     // robosuite's vectors: object state, then 50 numbers of the robot.
-    let robosuite = TableOptions { observation: ObservationKind::Robosuite, action: ActionKind::Pose, ..TableOptions::default() };
+    let robosuite =
+        TableOptions { observation: ObservationKind::Robosuite, action: ActionKind::Pose, ..TableOptions::default() };
     for (task, objects) in [(Task::Lift, 10), (Task::Stack, 23)] {
         let mut env = task.make_with(robosuite).expect("an arm task");
         assert_eq!((env.reset(0).len(), env.spec().action_size), (objects + 50, 7));

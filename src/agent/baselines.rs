@@ -21,9 +21,12 @@ impl Random {
     }
 }
 
+/// From a compact observation to an action.
+type Policy = dyn Fn(&[f32]) -> Vec<f32> + Send;
+
 /// The hand-written policy of one of the arm's tasks.
 pub struct Scripted {
-    policy: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
+    policy: Box<Policy>,
 }
 
 impl Scripted {

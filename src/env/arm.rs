@@ -40,18 +40,12 @@ pub enum PrimitiveKind {
 impl Primitive {
     /// A box at `centre`.
     pub fn cuboid(half: [f64; 3], centre: [f64; 3]) -> Self {
-        Self {
-            kind: PrimitiveKind::Box(half.into()),
-            pose: Pose::translation(centre[0], centre[1], centre[2]),
-        }
+        Self { kind: PrimitiveKind::Box(half.into()), pose: Pose::translation(centre[0], centre[1], centre[2]) }
     }
 
     /// A ball at `centre`.
     pub fn ball(radius: f64, centre: [f64; 3]) -> Self {
-        Self {
-            kind: PrimitiveKind::Ball(radius),
-            pose: Pose::translation(centre[0], centre[1], centre[2]),
-        }
+        Self { kind: PrimitiveKind::Ball(radius), pose: Pose::translation(centre[0], centre[1], centre[2]) }
     }
 
     /// A capsule whose axis runs from `a` to `b`.
@@ -81,11 +75,7 @@ pub struct Inertia {
 impl Inertia {
     /// A body whose principal axes are the frame's axes.
     pub fn diagonal(mass: f64, com: [f64; 3], principal: [f64; 3]) -> Self {
-        Self {
-            mass,
-            com: com.into(),
-            tensor: Matrix3::from_diagonal(&principal.into()),
-        }
+        Self { mass, com: com.into(), tensor: Matrix3::from_diagonal(&principal.into()) }
     }
 
     /// The same body seen from a frame in which its own frame stands at `pose`.
@@ -106,11 +96,7 @@ impl Inertia {
             let d = part.com - com;
             part.tensor + (Matrix3::identity() * d.norm_squared() - d * d.transpose()) * part.mass
         };
-        Self {
-            mass,
-            com,
-            tensor: about(self) + about(other),
-        }
+        Self { mass, com, tensor: about(self) + about(other) }
     }
 }
 
@@ -198,10 +184,7 @@ impl ArmDescription {
         let at = |p: [f64; 3], r: UnitQuaternion<f64>| Pose::from_parts(Translation3::from(Vector3::from(p)), r);
 
         // Hand and gripper body are bolted to link 7, the hand turned by -45.03 degrees.
-        let hand = at(
-            [0.0, 0.0, 0.1065],
-            UnitQuaternion::from_quaternion(Quaternion::new(0.924, 0.0, 0.0, -0.383)),
-        );
+        let hand = at([0.0, 0.0, 0.1065], UnitQuaternion::from_quaternion(Quaternion::new(0.924, 0.0, 0.0, -0.383)));
         let gripper_body = hand * at([0.0; 3], about_z(-FRAC_PI_2));
         let finger_mount = gripper_body * at([0.0, 0.0, 0.0524], about_z(FRAC_PI_2));
 
@@ -222,20 +205,80 @@ impl ArmDescription {
         let none = UnitQuaternion::identity();
         // mount, range, damping, torque limit, inertia (mass, centre of mass, moment), shapes
         let rows = [
-            (at([0.0, 0.0, 0.333], none), [-2.8973, 2.8973], 0.1, 80.0, Inertia::diagonal(3.0, [0.0, 0.0, -0.07], [0.3; 3]),
-             vec![Primitive::capsule(0.06, [0.0, 0.0, -0.19], [0.0, 0.0, 0.0]), Primitive::capsule(0.055, [0.0, -0.07, 0.0], [0.0, 0.0, 0.0])]),
-            (at([0.0; 3], back), [-1.7628, 1.7628], 0.1, 80.0, Inertia::diagonal(3.0, [0.0, -0.1, 0.0], [0.3; 3]),
-             vec![Primitive::capsule(0.055, [0.0, 0.0, 0.0], [0.0, 0.0, 0.07]), Primitive::capsule(0.06, [0.0, -0.14, 0.0], [0.0, 0.0, 0.0])]),
-            (at([0.0, -0.316, 0.0], turn), [-2.8973, 2.8973], 0.1, 80.0, Inertia::diagonal(2.0, [0.04, 0.0, -0.05], [0.2; 3]),
-             vec![Primitive::capsule(0.055, [0.0, 0.0, -0.11], [0.0, 0.0, 0.0]), Primitive::capsule(0.05, [0.0825, 0.0, 0.0], [0.0825, 0.06, 0.0])]),
-            (at([0.0825, 0.0, 0.0], turn), [-3.0718, -0.0698], 0.1, 80.0, Inertia::diagonal(2.0, [-0.04, 0.05, 0.0], [0.2; 3]),
-             vec![Primitive::capsule(0.05, [0.0, 0.0, 0.0], [0.0, 0.0, 0.06]), Primitive::capsule(0.055, [-0.0825, 0.06, 0.0], [-0.0825, 0.12, 0.0])]),
-            (at([-0.0825, 0.384, 0.0], back), [-2.8973, 2.8973], 0.1, 80.0, Inertia::diagonal(2.0, [0.0, 0.0, -0.15], [0.2; 3]),
-             vec![Primitive::capsule(0.05, [0.0, 0.0, -0.22], [0.0, 0.0, -0.12]), Primitive::capsule(0.045, [0.0, 0.06, -0.2], [0.0, 0.075, 0.0])]),
-            (at([0.0; 3], turn), [-0.0175, 3.7525], 0.01, 12.0, Inertia::diagonal(1.5, [0.06, 0.0, 0.0], [0.1; 3]),
-             vec![Primitive::capsule(0.048, [0.0, 0.0, 0.0], [0.088, 0.0, 0.0]), Primitive::capsule(0.045, [0.088, 0.0, 0.0], [0.088, 0.035, 0.0])]),
-            (at([0.088, 0.0, 0.0], turn), [-2.8973, 2.8973], 0.01, 12.0, link7,
-             vec![Primitive { kind: PrimitiveKind::Cylinder(0.044, 0.027), pose: at([0.0, 0.0, 0.08], none) }, palm]),
+            (
+                at([0.0, 0.0, 0.333], none),
+                [-2.8973, 2.8973],
+                0.1,
+                80.0,
+                Inertia::diagonal(3.0, [0.0, 0.0, -0.07], [0.3; 3]),
+                vec![
+                    Primitive::capsule(0.06, [0.0, 0.0, -0.19], [0.0, 0.0, 0.0]),
+                    Primitive::capsule(0.055, [0.0, -0.07, 0.0], [0.0, 0.0, 0.0]),
+                ],
+            ),
+            (
+                at([0.0; 3], back),
+                [-1.7628, 1.7628],
+                0.1,
+                80.0,
+                Inertia::diagonal(3.0, [0.0, -0.1, 0.0], [0.3; 3]),
+                vec![
+                    Primitive::capsule(0.055, [0.0, 0.0, 0.0], [0.0, 0.0, 0.07]),
+                    Primitive::capsule(0.06, [0.0, -0.14, 0.0], [0.0, 0.0, 0.0]),
+                ],
+            ),
+            (
+                at([0.0, -0.316, 0.0], turn),
+                [-2.8973, 2.8973],
+                0.1,
+                80.0,
+                Inertia::diagonal(2.0, [0.04, 0.0, -0.05], [0.2; 3]),
+                vec![
+                    Primitive::capsule(0.055, [0.0, 0.0, -0.11], [0.0, 0.0, 0.0]),
+                    Primitive::capsule(0.05, [0.0825, 0.0, 0.0], [0.0825, 0.06, 0.0]),
+                ],
+            ),
+            (
+                at([0.0825, 0.0, 0.0], turn),
+                [-3.0718, -0.0698],
+                0.1,
+                80.0,
+                Inertia::diagonal(2.0, [-0.04, 0.05, 0.0], [0.2; 3]),
+                vec![
+                    Primitive::capsule(0.05, [0.0, 0.0, 0.0], [0.0, 0.0, 0.06]),
+                    Primitive::capsule(0.055, [-0.0825, 0.06, 0.0], [-0.0825, 0.12, 0.0]),
+                ],
+            ),
+            (
+                at([-0.0825, 0.384, 0.0], back),
+                [-2.8973, 2.8973],
+                0.1,
+                80.0,
+                Inertia::diagonal(2.0, [0.0, 0.0, -0.15], [0.2; 3]),
+                vec![
+                    Primitive::capsule(0.05, [0.0, 0.0, -0.22], [0.0, 0.0, -0.12]),
+                    Primitive::capsule(0.045, [0.0, 0.06, -0.2], [0.0, 0.075, 0.0]),
+                ],
+            ),
+            (
+                at([0.0; 3], turn),
+                [-0.0175, 3.7525],
+                0.01,
+                12.0,
+                Inertia::diagonal(1.5, [0.06, 0.0, 0.0], [0.1; 3]),
+                vec![
+                    Primitive::capsule(0.048, [0.0, 0.0, 0.0], [0.088, 0.0, 0.0]),
+                    Primitive::capsule(0.045, [0.088, 0.0, 0.0], [0.088, 0.035, 0.0]),
+                ],
+            ),
+            (
+                at([0.088, 0.0, 0.0], turn),
+                [-2.8973, 2.8973],
+                0.01,
+                12.0,
+                link7,
+                vec![Primitive { kind: PrimitiveKind::Cylinder(0.044, 0.027), pose: at([0.0, 0.0, 0.08], none) }, palm],
+            ),
         ];
         let mut index = 0;
         let links = rows.map(|(mount, range, damping, max_torque, inertia, shapes)| {
@@ -276,15 +319,7 @@ impl ArmDescription {
                 pad: Primitive::cuboid([0.008, 0.004, 0.008], [0.0, 0.0035, 0.041]),
                 pad_friction: 2.0,
             },
-            home: JointVector::from([
-                0.0,
-                PI / 16.0,
-                0.0,
-                -5.0 * PI / 6.0,
-                0.0,
-                PI - 0.2,
-                PI / 4.0,
-            ]),
+            home: JointVector::from([0.0, PI / 16.0, 0.0, -5.0 * PI / 6.0, 0.0, PI - 0.2, PI / 4.0]),
             home_noise: 0.02,
         }
     }

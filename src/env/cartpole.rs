@@ -49,8 +49,7 @@ impl CartPoleState {
         let (sin, cos) = self.angle.sin_cos();
         let total = CART + POLE;
         let pushed = (force + POLE * HALF_LENGTH * self.spin.powi(2) * sin) / total;
-        let turning =
-            (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE * cos * cos / total));
+        let turning = (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE * cos * cos / total));
         let sliding = pushed - POLE * HALF_LENGTH * turning * cos / total;
         self.position += DT * self.velocity;
         self.velocity += DT * sliding;

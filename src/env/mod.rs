@@ -154,7 +154,7 @@ pub trait KnownReward {
     /// If the lengths do not fit together.
     fn rewards(&self, obs: &[f32], actions: &[f32], next_obs: &[f32], rewards: &mut [f32]) {
         let n = rewards.len().max(1);
-        assert!(obs.len() == next_obs.len() && obs.len() % n == 0 && actions.len() % n == 0);
+        assert!(obs.len() == next_obs.len() && obs.len().is_multiple_of(n) && actions.len().is_multiple_of(n));
         let rows = obs.chunks(obs.len() / n).zip(actions.chunks(actions.len() / n)).zip(next_obs.chunks(obs.len() / n));
         for (reward, ((obs, action), next)) in rewards.iter_mut().zip(rows) {
             *reward = self.reward(obs, action, next);

@@ -36,11 +36,7 @@ pub struct OperationalSpaceController {
 impl OperationalSpaceController {
     /// A controller that keeps `goal` and `posture` until they are changed.
     pub fn new(arm: &ArmDescription, goal: Goal, posture: JointVector) -> Self {
-        Self {
-            goal,
-            posture,
-            max_torque: JointVector::from_iterator(arm.links.iter().map(|link| link.max_torque)),
-        }
+        Self { goal, posture, max_torque: JointVector::from_iterator(arm.links.iter().map(|link| link.max_torque)) }
     }
 
     /// Joint torques (N m), beyond those that carry its weight, for the arm at joint angles `q` (rad), moving at `qd` (rad/s), whose
@@ -61,8 +57,8 @@ impl OperationalSpaceController {
         let for_position: Matrix3<f64> = mobility.fixed_view::<3, 3>(0, 0).into();
         let for_rotation: Matrix3<f64> = mobility.fixed_view::<3, 3>(3, 3).into();
 
-        let task = at.linear.transpose() * solve(for_position, force)
-            + at.angular.transpose() * solve(for_rotation, moment);
+        let task =
+            at.linear.transpose() * solve(for_position, force) + at.angular.transpose() * solve(for_rotation, moment);
 
         // The posture may use only what the hand does not feel.
         let posture = (self.posture - q) * POSTURE_STIFFNESS - qd * (2.0 * POSTURE_STIFFNESS.sqrt());
@@ -80,17 +76,11 @@ impl OperationalSpaceController {
 /// answering with infinite forces; elsewhere it is far below the arm's own mobility (about 0.03/kg).
 fn solve<const N: usize>(mobility: SMatrix<f64, N, N>, b: SMatrix<f64, N, 1>) -> SMatrix<f64, N, 1> {
     let ridge = SMatrix::<f64, N, N>::identity() * 1e-6;
-    (mobility + ridge)
-        .cholesky()
-        .expect("a mobility matrix is positive semi-definite")
-        .solve(&b)
+    (mobility + ridge).cholesky().expect("a mobility matrix is positive semi-definite").solve(&b)
 }
 
 /// The rotation that is missing from `now` to `goal`: sin(angle) times the axis, world frame.
 fn rotation_error(now: &UnitQuaternion<f64>, goal: &UnitQuaternion<f64>) -> Vector3<f64> {
     let (now, goal) = (now.to_rotation_matrix(), goal.to_rotation_matrix());
-    (0..3)
-        .map(|axis| now.matrix().column(axis).cross(&goal.matrix().column(axis)))
-        .sum::<Vector3<f64>>()
-        * 0.5
+    (0..3).map(|axis| now.matrix().column(axis).cross(&goal.matrix().column(axis))).sum::<Vector3<f64>>() * 0.5
 }

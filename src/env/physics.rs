@@ -108,10 +108,7 @@ impl Clone for Physics {
 impl Physics {
     /// A table with `arm` beside it, at its home posture.
     pub fn new(arm: ArmDescription) -> Self {
-        let mut world = PhysicsWorld {
-            gravity: Vector::new(0.0, 0.0, -GRAVITY as f32),
-            ..PhysicsWorld::default()
-        };
+        let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -GRAVITY as f32), ..PhysicsWorld::default() };
         let settings = &mut world.integration_parameters;
         settings.dt = TIMESTEP as f32;
         settings.num_internal_pgs_iterations = 4;
@@ -133,10 +130,8 @@ impl Physics {
             0.0,
             (TABLE_TOP - TABLE_HALF[2]) as f32,
         )));
-        let table = world.insert_collider(
-            surface(collider(PrimitiveKind::Box(TABLE_HALF.into())), 1.0),
-            Some(table_body),
-        );
+        let table =
+            world.insert_collider(surface(collider(PrimitiveKind::Box(TABLE_HALF.into())), 1.0), Some(table_body));
 
         let base = world.insert_body(RigidBodyBuilder::fixed().pose(to_rapier(&arm.base)));
         let mut parent = base;
@@ -154,11 +149,7 @@ impl Physics {
                 .local_frame1(to_rapier(&(link.mount * hinge)))
                 .local_frame2(to_rapier(&hinge))
                 .limits(JointAxis::AngX, link.range.map(|limit| limit as f32));
-            handles.push(
-                world
-                    .insert_multibody_joint(parent, body, joint.build())
-                    .expect("a chain has no loops"),
-            );
+            handles.push(world.insert_multibody_joint(parent, body, joint.build()).expect("a chain has no loops"));
             parent = body;
             body
         });
@@ -179,9 +170,7 @@ impl Physics {
                 .local_frame2(to_rapier(&slide))
                 .limits(JointAxis::LinX, gripper.range.map(|limit| limit as f32));
             handles.push(
-                world
-                    .insert_multibody_joint(links[JOINTS - 1], body, joint.build())
-                    .expect("a chain has no loops"),
+                world.insert_multibody_joint(links[JOINTS - 1], body, joint.build()).expect("a chain has no loops"),
             );
             body
         });
@@ -246,8 +235,7 @@ impl Physics {
 
     /// Positions and velocities of all joints.
     pub fn joint_state(&self) -> JointState {
-        let (multibody, _) =
-            self.world.multibody_joints.get(self.joints[0]).expect("the arm is in the world");
+        let (multibody, _) = self.world.multibody_joints.get(self.joints[0]).expect("the arm is in the world");
         let velocity = multibody.generalized_velocity();
         // Link 0 of the multibody is the base.
         let coordinate = |joint: usize, axis: usize| {
@@ -311,8 +299,7 @@ impl Physics {
     /// Tells the solver only of those joint limits that are near: each costs it a row in every
     /// substep, however far away.
     fn watch_limits(&mut self, joints: &JointState) {
-        let (multibody, _) =
-            self.world.multibody_joints.get_mut(self.joints[0]).expect("the arm is in the world");
+        let (multibody, _) = self.world.multibody_joints.get_mut(self.joints[0]).expect("the arm is in the world");
         let hinges = self.arm.links.iter().zip(joints.q.iter());
         let hinges = hinges.map(|(link, q)| (link.range, *q, HINGE_MARGIN, JointAxesMask::ANG_X));
         let slides = joints.fingers.map(|q| (self.arm.gripper.range, q, SLIDE_MARGIN, JointAxesMask::LIN_X));
@@ -324,9 +311,7 @@ impl Physics {
 
     /// Puts a box on the scene: half extents (m), density (kg/m3), friction coefficient, pose.
     pub fn add_box(&mut self, half: [f64; 3], density: f64, friction: f64, pose: &Pose) -> Object {
-        let body = self
-            .world
-            .insert_body(RigidBodyBuilder::dynamic().pose(to_rapier(pose)).can_sleep(false));
+        let body = self.world.insert_body(RigidBodyBuilder::dynamic().pose(to_rapier(pose)).can_sleep(false));
         let shape = collider(PrimitiveKind::Box(half.into())).density(density as f32);
         let collider = self.world.insert_collider(surface_with_density(shape, friction), Some(body));
         Object { body, collider }
@@ -412,7 +397,9 @@ fn collider(kind: PrimitiveKind) -> ColliderBuilder {
     match kind {
         PrimitiveKind::Box(half) => ColliderBuilder::cuboid(half.x as f32, half.y as f32, half.z as f32),
         PrimitiveKind::Capsule(radius, half) => ColliderBuilder::capsule_z(half as f32, radius as f32),
-        PrimitiveKind::Cylinder(radius, half) => ColliderBuilder::capsule_z((half - radius).max(0.0) as f32, radius as f32),
+        PrimitiveKind::Cylinder(radius, half) => {
+            ColliderBuilder::capsule_z((half - radius).max(0.0) as f32, radius as f32)
+        }
         PrimitiveKind::Ball(radius) => ColliderBuilder::ball(radius as f32),
     }
 }
@@ -428,10 +415,7 @@ fn surface(collider: ColliderBuilder, friction: f64) -> ColliderBuilder {
 
 /// The rougher of two surfaces decides, as in MuJoCo; nothing bounces.
 fn surface_with_density(collider: ColliderBuilder, friction: f64) -> ColliderBuilder {
-    collider
-        .friction(friction as f32)
-        .friction_combine_rule(CoefficientCombineRule::Max)
-        .restitution(0.0)
+    collider.friction(friction as f32).friction_combine_rule(CoefficientCombineRule::Max).restitution(0.0)
 }
 
 fn to_vector(v: &Vector3<f64>) -> Vector {

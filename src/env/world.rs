@@ -30,8 +30,7 @@ pub enum Task {
 
 impl Task {
     /// All tasks.
-    pub const ALL: [Task; 6] =
-        [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum, Task::Cartpole];
+    pub const ALL: [Task; 6] = [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum, Task::Cartpole];
 
     /// Its name, as the command line has it.
     pub fn name(self) -> &'static str {

@@ -3,7 +3,7 @@
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
-use super::Tensor3;
+use super::{Tensor2, Tensor3};
 
 /// Log standard deviations are squashed into this range, so that their gradient never dies as it
 /// does at a hard clamp (as CleanRL does; SB3 clamps to [-20, 2]).
@@ -37,7 +37,7 @@ impl<T: Tape<f32, Cpu>> SquashedGaussian<T> {
     ///
     /// ln(1 - tanh(u)^2) is computed as 2 (ln 2 - u - softplus(-2u)), which is exact where the usual
     /// ln(1 - a^2 + 1e-6) saturates.
-    pub fn sample(self, noise: Tensor3) -> (Tensor3<T>, Tensor<(usize, usize), f32, Cpu, T>) {
+    pub fn sample(self, noise: Tensor3) -> (Tensor3<T>, Tensor2<T>) {
         let std = self.log_std.with_empty_tape().exp();
         let u = self.mean + std * noise.clone();
         let action = u.with_empty_tape().tanh();

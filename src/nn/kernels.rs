@@ -28,19 +28,13 @@ pub struct Matrix<'a> {
 impl<'a> Matrix<'a> {
     /// `data` as a matrix of so many columns.
     pub fn new(data: &'a [f32], cols: usize) -> Self {
-        assert!(cols > 0 && data.len() % cols == 0, "rows of equal length");
+        assert!(cols > 0 && data.len().is_multiple_of(cols), "rows of equal length");
         Self { data, rows: data.len() / cols, cols, row_stride: cols as isize, col_stride: 1 }
     }
 
     /// The transposed matrix; nothing is copied.
     pub fn t(self) -> Self {
-        Self {
-            rows: self.cols,
-            cols: self.rows,
-            row_stride: self.col_stride,
-            col_stride: self.row_stride,
-            ..self
-        }
+        Self { rows: self.cols, cols: self.rows, row_stride: self.col_stride, col_stride: self.row_stride, ..self }
     }
 
     /// The rows `from..to`.
@@ -167,7 +161,9 @@ pub fn through_activation(dy: &mut [f32], y: &[f32], activation: Activation) {
 
 /// Adds the gradient of x: `dx += dz w'`. A shared input collects from all networks.
 pub fn dense_input_gradient(dx: &mut [f32], dz: &[f32], w: &[f32], shape: DenseShape) {
-    let dz_of = |member: usize| Matrix::new(&dz[member * shape.batch * shape.output..][..shape.batch * shape.output], shape.output);
+    let dz_of = |member: usize| {
+        Matrix::new(&dz[member * shape.batch * shape.output..][..shape.batch * shape.output], shape.output)
+    };
     let rows = shape.rows_per_task(shape.batch);
     let one = |member: usize, dx: &mut [f32]| {
         dx.par_chunks_mut(rows * shape.input).enumerate().for_each(|(task, dx)| {

@@ -66,8 +66,7 @@ struct Layer {
 impl Mlp {
     /// New networks. Weights and biases are uniform in +-1/sqrt(inputs), as in PyTorch.
     pub fn new(cpu: &Cpu, config: &MlpConfig, rng: &mut Rng) -> Self {
-        let sizes: Vec<usize> =
-            [config.input].iter().chain(&config.hidden).chain([&config.output]).copied().collect();
+        let sizes: Vec<usize> = [config.input].iter().chain(&config.hidden).chain([&config.output]).copied().collect();
         let members = config.members;
         let mut layers = Vec::with_capacity(sizes.len() - 1);
         for (i, size) in sizes.windows(2).enumerate() {

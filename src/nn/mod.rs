@@ -17,7 +17,7 @@ pub use dfdx;
 pub use gaussian::SquashedGaussian;
 pub use kernels::Activation;
 pub use layers::{Mlp, MlpConfig, Parameters, copy_parameters, polyak};
-pub use ops::{Learning, Tensor3, values};
+pub use ops::{Learning, Tensor2, Tensor3, values};
 pub use weights::Weights;
 
 use dfdx::tensor::{Cache, Cpu, TensorFrom};

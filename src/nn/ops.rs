@@ -10,6 +10,8 @@ use super::kernels::{self, Activation, DenseShape};
 
 /// Features of several networks, `[members, batch, features]`; also parameters, see [`dense`].
 pub type Tensor3<T = NoneTape> = Tensor<(usize, usize, usize), f32, Cpu, T>;
+/// One number for each row of each network, `[members, batch]`.
+pub type Tensor2<T = NoneTape> = Tensor<(usize, usize), f32, Cpu, T>;
 /// The numbers of a tensor, in row-major order, without copying them.
 ///
 /// # Panics
@@ -137,7 +139,8 @@ pub fn layer_norm<T: Tape<f32, Cpu>>(
                 let d_shift = gradients.get_or_alloc_mut(&shift)?;
                 for (row, (dz, x)) in dz.chunks_exact(features).zip(normal.chunks_exact(features)).enumerate() {
                     let of_member = row / batch * features..;
-                    let (d_gain, d_shift) = (&mut d_gain[of_member.clone()][..features], &mut d_shift[of_member][..features]);
+                    let (d_gain, d_shift) =
+                        (&mut d_gain[of_member.clone()][..features], &mut d_shift[of_member][..features]);
                     kernels::vectorised(|| {
                         for (((d_gain, d_shift), dz), x) in d_gain.iter_mut().zip(d_shift).zip(dz).zip(x) {
                             *d_gain += dz * x;

@@ -128,7 +128,10 @@ impl Weights {
     pub fn read(path: &Path) -> Result<Self> {
         let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
         let file = SafeTensors::deserialize(&bytes).map_err(|problem| {
-            Error::bad_file(path, format!("damaged, or no safetensors file ({problem}); restore it or start the run anew"))
+            Error::bad_file(
+                path,
+                format!("damaged, or no safetensors file ({problem}); restore it or start the run anew"),
+            )
         })?;
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|problem| Error::bad_file(path, problem))?;
         let notes = header.metadata().clone().unwrap_or_default().into_iter().collect();
@@ -136,7 +139,12 @@ impl Weights {
         for (name, view) in file.tensors() {
             let shape: [usize; 3] = match (view.dtype(), view.shape().try_into()) {
                 (Dtype::F32, Ok(shape)) => shape,
-                _ => return Err(Error::bad_file(path, format!("`{name}` is not one of our arrays; is this file from another program?"))),
+                _ => {
+                    return Err(Error::bad_file(
+                        path,
+                        format!("`{name}` is not one of our arrays; is this file from another program?"),
+                    ));
+                }
             };
             weights.insert(name, bytemuck::pod_collect_to_vec(view.data()), shape);
         }

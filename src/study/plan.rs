@@ -37,9 +37,7 @@ impl StudyPlan {
         let methods = ["random", "scripted", "sac"].map(String::from).into();
         match profile {
             Profile::Quick => Self { tasks: vec![Task::Reach], methods, seeds: 0..2, folder },
-            Profile::Full => {
-                Self { tasks: vec![Task::Reach, Task::Push, Task::Lift], methods, seeds: 0..5, folder }
-            }
+            Profile::Full => Self { tasks: vec![Task::Reach, Task::Push, Task::Lift], methods, seeds: 0..5, folder },
         }
     }
 
@@ -90,7 +88,13 @@ pub trait Observer: Sync {
 ///
 /// # Errors
 /// What the run answers, and [`Error::Interrupted`].
-pub fn carry_out(index: usize, config: &RunConfig, folder: &Path, observer: &dyn Observer, stop: &AtomicBool) -> Result<()> {
+pub fn carry_out(
+    index: usize,
+    config: &RunConfig,
+    folder: &Path,
+    observer: &dyn Observer,
+    stop: &AtomicBool,
+) -> Result<()> {
     let mut run = Run::open(config.clone(), folder)?;
     observer.started(index, config, run.steps_done());
     loop {
@@ -110,7 +114,12 @@ pub fn carry_out(index: usize, config: &RunConfig, folder: &Path, observer: &dyn
 ///
 /// # Errors
 /// The first error of a run; the others are then stopped and saved.
-pub fn carry_out_all(runs: &[(RunConfig, PathBuf)], jobs: usize, observer: &dyn Observer, stop: &AtomicBool) -> Result<()> {
+pub fn carry_out_all(
+    runs: &[(RunConfig, PathBuf)],
+    jobs: usize,
+    observer: &dyn Observer,
+    stop: &AtomicBool,
+) -> Result<()> {
     let next = AtomicUsize::new(0);
     let failure = Mutex::new(None);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -122,7 +131,9 @@ pub fn carry_out_all(runs: &[(RunConfig, PathBuf)], jobs: usize, observer: &dyn 
                     .build()
                     .expect("threads for a run");
                 while let Some((config, folder)) = runs.get(next.fetch_add(1, Ordering::SeqCst)) {
-                    if run::is_complete(folder) && RunConfig::read(&folder.join("config.toml")).is_ok_and(|c| c == *config) {
+                    if run::is_complete(folder)
+                        && RunConfig::read(&folder.join("config.toml")).is_ok_and(|c| c == *config)
+                    {
                         continue;
                     }
                     let index = runs.iter().position(|(_, other)| other == folder).expect("a run of this study");

@@ -38,7 +38,8 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         write!(text, "\n## {task}\n\n").expect("text grows");
         text += &findings(&tables, task)?;
         write!(text, "\n![Success of each method on {task} over environment steps]({curves})\n").expect("text grows");
-        write!(text, "\n![Success and smoothness of each method on {task} in the test]({tests})\n").expect("text grows");
+        write!(text, "\n![Success and smoothness of each method on {task} in the test]({tests})\n")
+            .expect("text grows");
     }
     text += "\n## How sure is this?\n\n";
     text += &caveat(&tables, &pairs)?;
@@ -46,8 +47,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     Ok(text_table(&rows(&tables)?))
 }
 
-const HEAD: [&str; 9] =
-    ["task", "method", "seeds", "steps", "success", "return", "steps to 80 %", "SPARC", "LDLJ"];
+const HEAD: [&str; 9] = ["task", "method", "seeds", "steps", "success", "return", "steps to 80 %", "SPARC", "LDLJ"];
 
 fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
     let mut rows = Vec::new();
@@ -56,9 +56,8 @@ fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
         let show = |column: &str, digits: usize| -> Result<String> {
             Ok(value(column)?.map_or("-".into(), |v| format!("{v:.digits$}")))
         };
-        let percent = |column: &str| -> Result<String> {
-            Ok(format!("{:.0}", 100.0 * value(column)?.unwrap_or(f64::NAN)))
-        };
+        let percent =
+            |column: &str| -> Result<String> { Ok(format!("{:.0}", 100.0 * value(column)?.unwrap_or(f64::NAN))) };
         let success = format!("{} % [{}, {}]", percent("success")?, percent("success_low")?, percent("success_high")?);
         rows.push([
             task.clone(),

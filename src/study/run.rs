@@ -147,11 +147,7 @@ impl Run {
             files::write(&config_path, text.as_bytes())?;
         }
         let checkpoint = folder.join("checkpoint").join("state.safetensors");
-        let progress = if checkpoint.exists() {
-            load(&checkpoint, agent.as_mut())?
-        } else {
-            Progress::default()
-        };
+        let progress = if checkpoint.exists() { load(&checkpoint, agent.as_mut())? } else { Progress::default() };
         let make = || config.world();
         let mut run = Self {
             world,
@@ -307,16 +303,8 @@ impl Run {
 }
 
 const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "length", "seconds"];
-const EVALUATION_COLUMNS: [&str; 8] = [
-    "step",
-    "episodes",
-    "success",
-    "return_mean",
-    "return_std",
-    "smoothness_sparc",
-    "smoothness_ldlj",
-    "action_ms",
-];
+const EVALUATION_COLUMNS: [&str; 8] =
+    ["step", "episodes", "success", "return_mean", "return_std", "smoothness_sparc", "smoothness_ldlj", "action_ms"];
 const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
 
 /// Whether the run in `folder` is complete.
@@ -366,9 +354,8 @@ fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
 
 fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
     let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
-    let composed = writer.write_record(columns).and_then(|()| {
-        rows.into_iter().try_for_each(|row| writer.serialize(row))
-    });
+    let composed =
+        writer.write_record(columns).and_then(|()| rows.into_iter().try_for_each(|row| writer.serialize(row)));
     composed.map_err(|problem| Error::bad_file(path, problem))?;
     let bytes = writer.into_inner().map_err(|problem| Error::bad_file(path, problem))?;
     files::write(path, &bytes)

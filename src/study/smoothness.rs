@@ -16,8 +16,7 @@ const THRESHOLD: f64 = 0.05;
 /// Smoothness of a path of hand positions (m) sampled every `dt` seconds: SPARC and LDLJ. `None`
 /// where nothing moves.
 pub fn of_path(path: &[[f64; 3]], dt: f64) -> Option<(f64, f64)> {
-    let velocity: Vec<[f64; 3]> =
-        path.windows(2).map(|p| std::array::from_fn(|i| (p[1][i] - p[0][i]) / dt)).collect();
+    let velocity: Vec<[f64; 3]> = path.windows(2).map(|p| std::array::from_fn(|i| (p[1][i] - p[0][i]) / dt)).collect();
     let speed: Vec<f64> = velocity.iter().map(norm).collect();
     let top = speed.iter().copied().fold(0.0, f64::max);
     let moving = |v: &&f64| **v >= REST * top;

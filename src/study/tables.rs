@@ -76,7 +76,8 @@ impl Tables {
     /// # Errors
     /// If a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
-        let tables = [("evaluations.csv", &self.evaluations), ("tests.csv", &self.tests), ("summary.csv", &self.summary)];
+        let tables =
+            [("evaluations.csv", &self.evaluations), ("tests.csv", &self.tests), ("summary.csv", &self.summary)];
         for (name, table) in tables {
             let mut bytes = Vec::new();
             if table.width() > 0 {
@@ -132,9 +133,10 @@ fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFra
         let curves = curves(evaluations, task, method)?;
         let reached: Vec<f64> = curves.iter().filter_map(|(x, y)| steps_to(LEVEL, x, y)).collect();
         let areas: Vec<f64> = curves.iter().map(|(x, y)| area_under_curve(x, y)).collect();
-        let budget = curves.iter().filter_map(|(x, _)| x.last().copied()).fold(None, |a: Option<f64>, x| {
-            Some(a.map_or(x, |a| a.max(x)))
-        });
+        let budget = curves
+            .iter()
+            .filter_map(|(x, _)| x.last().copied())
+            .fold(None, |a: Option<f64>, x| Some(a.map_or(x, |a| a.max(x))));
         // The median over all seeds; a seed that never gets there counts as infinitely many steps.
         let median = (!curves.is_empty()).then(|| median_with_missing(&reached, curves.len())).flatten();
         let values = [
@@ -150,17 +152,14 @@ fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFra
             mean_of("return")?,
             mean_of("length")?,
             median,
-            (!curves.is_empty()).then(|| reached.len() as f64),
+            (!curves.is_empty()).then_some(reached.len() as f64),
             (!areas.is_empty()).then(|| mean(&areas)),
             mean_of("sparc")?,
             mean_of("ldlj")?,
         ];
         columns.iter_mut().zip(values).for_each(|((_, column), value)| column.push(value));
     }
-    let mut all = vec![
-        Column::new("task".into(), tasks),
-        Column::new("method".into(), methods),
-    ];
+    let mut all = vec![Column::new("task".into(), tasks), Column::new("method".into(), methods)];
     all.extend(columns.into_iter().map(|(name, values)| Column::new(name.into(), values)));
     DataFrame::new_infer_height(all)
 }

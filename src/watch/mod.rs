@@ -6,10 +6,10 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::agent::Agent;
+use crate::agent::Mode;
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
 use crate::env::scene::Body;
 use crate::env::{Env, World};
-use crate::agent::Mode;
 use crate::error::Result;
 use crate::files;
 
@@ -102,9 +102,8 @@ impl Recording {
     pub fn to_html(&self) -> String {
         // In JSON, `<` may be written so, and no name can then close the script around it.
         let json = serde_json::to_string(self).expect("a recording is JSON").replace('<', "\\u003c");
-        let escape = |text: &str| {
-            text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-        };
+        let escape =
+            |text: &str| text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;");
         let title = escape(&self.title);
         // One pass: what has been filled in is not searched again.
         let mut page = String::new();

@@ -267,9 +267,7 @@ impl Tabletop {
         });
         match self.options.observation {
             ObservationKind::Compact => self.state.compact.clone(),
-            ObservationKind::Robosuite => {
-                robosuite::observe(self).into_iter().map(|(_, value)| value as f32).collect()
-            }
+            ObservationKind::Robosuite => robosuite::observe(self).into_iter().map(|(_, value)| value as f32).collect(),
         }
     }
 
@@ -284,10 +282,8 @@ impl Tabletop {
                 (turn * hand.rotation, if a[6] == 0.0 { 0.0 } else { a[6].signum() })
             }
         };
-        self.state.controller.goal = Goal {
-            position: hand.translation.vector + Vector3::new(a[0], a[1], a[2]) * MAX_LEAD,
-            orientation,
-        };
+        self.state.controller.goal =
+            Goal { position: hand.translation.vector + Vector3::new(a[0], a[1], a[2]) * MAX_LEAD, orientation };
         if self.task.uses_gripper() {
             let gripper = &self.state.physics.arm().gripper;
             let [closed, open] = gripper.range;

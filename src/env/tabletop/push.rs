@@ -93,8 +93,7 @@ impl TableTask for Push {
         let hand_to_cube = vector(obs, HAND_TO_CUBE).norm();
         let cube_to_goal = vector(obs, CUBE_TO_GOAL).norm();
         let success = cube_to_goal < TOLERANCE;
-        let shaped =
-            if success { 1.0 } else { 0.25 * closeness(hand_to_cube) + 0.75 * closeness(cube_to_goal) };
+        let shaped = if success { 1.0 } else { 0.25 * closeness(hand_to_cube) + 0.75 * closeness(cube_to_goal) };
         Judgement { shaped, success, stage: if success { 2 } else { usize::from(hand_to_cube < 0.05) } }
     }
 

@@ -51,10 +51,8 @@ impl TableTask for Stack {
                 break cube;
             }
         };
-        let objects = vec![
-            physics.add_box([HALF[0]; 3], 1000.0, 1.0, &cube),
-            physics.add_box([HALF[1]; 3], 1000.0, 1.0, &base),
-        ];
+        let objects =
+            vec![physics.add_box([HALF[0]; 3], 1000.0, 1.0, &cube), physics.add_box([HALF[1]; 3], 1000.0, 1.0, &base)];
         Setup { objects, goal: None }
     }
 
@@ -79,8 +77,7 @@ impl TableTask for Stack {
     }
 
     fn object_state(&self, view: &View) -> Vec<(String, f64)> {
-        let [cube, base] =
-            [0, 1].map(|i| view.physics.object_state(view.setup.objects[i]).pose.translation.vector);
+        let [cube, base] = [0, 1].map(|i| view.physics.object_state(view.setup.objects[i]).pose.translation.vector);
         let a = object_state_of(view, 0, "cubeA", "gripper_to_cubeA");
         let b = object_state_of(view, 1, "cubeB", "gripper_to_cubeB");
         // robosuite lists both poses first, then the vectors between things.
