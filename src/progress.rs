@@ -1,6 +1,7 @@
 //! Progress on the terminal: a bar for each run that is under way; where there is no terminal, a line for each
 //! evaluation.
 
+use std::fmt::Write;
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
@@ -8,7 +9,7 @@ use std::time::Duration;
 use handful::study::config::RunConfig;
 use handful::study::plan::Observer;
 use handful::study::run::Event;
-use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressState, ProgressStyle};
 
 /// Shows how the runs of a study go.
 pub struct Progress {
@@ -60,14 +61,20 @@ impl Shown {
 impl Observer for Progress {
     fn started(&self, run: usize, config: &RunConfig, done: usize) {
         let mut shown = self.runs[run].lock().expect("no panic holds it");
-        let steps = if config.learns() { config.steps as u64 } else { 0 };
-        let template = "{prefix:24} [{bar:24}] {pos}/{len} steps  {per_sec:.0}/s  {eta} left  {msg}";
-        let style = ProgressStyle::with_template(template).expect("our template").progress_chars("=> ");
-        let style = style.with_key("per_sec", |state: &indicatif::ProgressState, out: &mut dyn std::fmt::Write| {
-            let _ = write!(out, "{:.0}", state.per_sec());
-        });
-        let style = style.template("{prefix:24} [{bar:24}] {pos}/{len} steps  {per_sec}/s  {eta} left  {msg}");
-        let bar = self.bars.add(ProgressBar::new(steps)).with_style(style.expect("our template"));
+        let bar = if config.learns() {
+            // indicatif's own speed has no decimals to leave out.
+            let speed = |state: &ProgressState, out: &mut dyn Write| {
+                let _ = write!(out, "{:.0}/s", state.per_sec());
+            };
+            let style =
+                ProgressStyle::with_template("{prefix:24} [{bar:24}] {pos}/{len} steps  {speed}  {eta} left  {msg}");
+            let style = style.expect("our template").progress_chars("=> ").with_key("speed", speed);
+            ProgressBar::new(config.steps as u64).with_style(style)
+        } else {
+            ProgressBar::new_spinner()
+                .with_style(ProgressStyle::with_template("{prefix:24} {spinner} testing").expect("our template"))
+        };
+        let bar = self.bars.add(bar);
         bar.set_prefix(shown.name.clone());
         bar.set_position(done as u64);
         bar.reset_eta();

@@ -23,6 +23,9 @@ use crate::nn::{
 use crate::replay::{Batch, ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
 
+/// Scaled observations are clamped to this.
+const MAX_INPUT: f32 = 10.0;
+
 /// Settings of [`Sac`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -222,7 +225,11 @@ impl Sac {
     /// Observations as the networks see them, `[1, rows, observation]`.
     fn observations(&self, raw: &[f32]) -> Tensor3 {
         let size = self.centre.len();
-        let scaled = raw.iter().enumerate().map(|(i, x)| (x - self.centre[i % size]) / self.scale[i % size]);
+        let scaled = raw.iter().enumerate().map(|(i, x)| {
+            let scaled = (x - self.centre[i % size]) / self.scale[i % size];
+            // A cube on the floor is far enough away; networks need not see how far.
+            scaled.clamp(-MAX_INPUT, MAX_INPUT)
+        });
         tensor(&self.cpu, scaled.collect(), (1, raw.len() / size, size))
     }
 

@@ -133,6 +133,9 @@ impl Physics {
         let table =
             world.insert_collider(surface(collider(PrimitiveKind::Box(TABLE_HALF.into())), 1.0), Some(table_body));
 
+        // What falls off the table stays in the room.
+        world.insert_collider(surface(ColliderBuilder::new(SharedShape::halfspace(Vector::Z)), 1.0), None);
+
         let base = world.insert_body(RigidBodyBuilder::fixed().pose(to_rapier(&arm.base)));
         let mut parent = base;
         let mut handles = Vec::with_capacity(JOINTS + 2);

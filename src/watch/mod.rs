@@ -80,7 +80,7 @@ impl Recording {
             obs = step.observation;
         }
         let camera = match world {
-            World::Tabletop(_) => Camera { eye: [1.2, -1.3, 1.6], target: [-0.15, 0.0, 1.0] },
+            World::Tabletop(_) => Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] },
             World::Pendulum(_) => Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] },
             World::CartPole(_) => Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] },
         };
