@@ -225,12 +225,14 @@ impl Sac {
     /// Observations as the networks see them, `[1, rows, observation]`.
     fn observations(&self, raw: &[f32]) -> Tensor3 {
         let size = self.centre.len();
-        let scaled = raw.iter().enumerate().map(|(i, x)| {
-            let scaled = (x - self.centre[i % size]) / self.scale[i % size];
+        let features = || self.centre.iter().zip(&self.scale);
+        let mut scaled = Vec::with_capacity(raw.len());
+        for row in raw.chunks_exact(size) {
             // A cube on the floor is far enough away; networks need not see how far.
-            scaled.clamp(-MAX_INPUT, MAX_INPUT)
-        });
-        tensor(&self.cpu, scaled.collect(), (1, raw.len() / size, size))
+            let row = row.iter().zip(features());
+            scaled.extend(row.map(|(x, (centre, scale))| ((x - centre) / scale).clamp(-MAX_INPUT, MAX_INPUT)));
+        }
+        tensor(&self.cpu, scaled, (1, raw.len() / size, size))
     }
 
     fn noise(&mut self, rows: usize) -> Tensor3 {

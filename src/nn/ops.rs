@@ -188,8 +188,11 @@ pub fn join<T: Tape<f32, Cpu> + Merge<R>, R: Tape<f32, Cpu>>(a: Tensor3<T>, b: T
     let (&(members, batch, wide_a), &(_, _, wide_b)) = (a.shape(), b.shape());
     assert_eq!((members, batch), (b.shape().0, b.shape().1), "the same rows on both sides");
     let wide = wide_a + wide_b;
-    let rows = values(&a).chunks_exact(wide_a).zip(values(&b).chunks_exact(wide_b));
-    let joined = rows.flat_map(|(a, b)| a.iter().chain(b).copied()).collect();
+    let mut joined = Vec::with_capacity(members * batch * wide);
+    for (a, b) in values(&a).chunks_exact(wide_a).zip(values(&b).chunks_exact(wide_b)) {
+        joined.extend_from_slice(a);
+        joined.extend_from_slice(b);
+    }
     let y = a.device().tensor_from_vec(joined, (members, batch, wide));
     if T::OWNS_TAPE {
         let y = y.clone();
