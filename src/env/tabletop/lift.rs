@@ -1,6 +1,6 @@
 //! `lift`: take the cube from the table. robosuite's Lift, with its numbers.
 
-use super::{
+use super::task::{
     HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, object_features,
     object_state_of, object_values, on_table, towards, vector, xyz,
 };

@@ -4,7 +4,7 @@
 
 use nalgebra::Vector3;
 
-use super::{
+use super::task::{
     HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, named, object_features, object_state_of,
     object_values, on_table, towards, vector, xyz,
 };

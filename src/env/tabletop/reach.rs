@@ -4,7 +4,7 @@
 
 use nalgebra::Vector3;
 
-use super::{HAND_POSITION, Judgement, Setup, TableTask, View, closeness, named, towards, vector, xyz};
+use super::task::{HAND_POSITION, Judgement, Setup, TableTask, View, closeness, named, towards, vector, xyz};
 use crate::env::Feature;
 use crate::env::physics::Physics;
 use crate::env::scene::Body;

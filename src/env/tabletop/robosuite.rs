@@ -2,7 +2,8 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::{Tabletop, named};
+use super::Tabletop;
+use super::task::named;
 
 /// Names and values, in robosuite's order.
 pub(super) fn observe(tabletop: &Tabletop) -> Vec<(String, f64)> {

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::lift::{CUBE, LIFTED, descend_and_close, grasped};
-use super::{
+use super::task::{
     Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, named, object_features,
     object_state_of, object_values, on_table, towards, vector, xyz,
 };
