@@ -7,13 +7,16 @@
 //! | 3 | [`study`] | runs, the protocol by which agents are judged, tables, figures, reports |
 //! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
 //! | 2 | [`agent`] | agents: the wiring of what stands below |
+//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI: optimisers of a closure over action sequences |
 //! | 1 | [`replay`] | what was experienced |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
 //! | 0 | [`env`](mod@env) | worlds to act in: the arm at its table, pendulum, cart-pole |
 //! | 0 | [`rng`], [`files`], [`error`] | random numbers, files that are written whole, what can go wrong |
 //!
 //! What holds everywhere:
-//! - Agents know an environment by the trait [`env::Env`] alone; so does the study.
+//! - Agents know an environment by the trait [`env::Env`] alone; so does the study. The one exception is the
+//!   oracle, which plans on the true world and says so.
+//! - A planner never sees an environment: it maximises a closure.
 //! - No global state: every random number comes from a generator that was passed in, and one seed
 //!   fixes a run bit for bit on one machine.
 //! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
@@ -65,6 +68,7 @@ pub mod env;
 pub mod error;
 pub mod files;
 pub mod nn;
+pub mod plan;
 pub mod replay;
 pub mod rng;
 pub mod study;

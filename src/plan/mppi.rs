@@ -1,0 +1,130 @@
+//! Model-predictive path integrals (Williams et al. 2015), in the filtered form of PDDM (Nagabandi et al. 2019):
+//! every sample counts, the better the more, and noise is smoothed along the horizon.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, as_actions, shifted};
+use crate::rng::{self, Rng};
+
+/// Settings of [`Mppi`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MppiConfig {
+    /// Steps that it looks ahead.
+    pub horizon: usize,
+    /// Sequences tried in an iteration.
+    pub population: usize,
+    /// Iterations.
+    pub iterations: usize,
+    /// Standard deviation of the noise.
+    pub deviation: f64,
+    /// Weight of an action against the one before it; 1 does not smooth.
+    pub smoothing: f64,
+    /// How much return makes a sample count e times more, as a share of the spread (standard deviation) of all
+    /// returns: the scale of rewards does not matter.
+    pub temperature: f64,
+}
+
+impl Default for MppiConfig {
+    fn default() -> Self {
+        Self { horizon: 15, population: 200, iterations: 2, deviation: 0.8, smoothing: 0.6, temperature: 0.3 }
+    }
+}
+
+/// The planner.
+pub struct Mppi {
+    config: MppiConfig,
+    actions: usize,
+    mean: Vec<f64>,
+    /// The action executed last.
+    before: Vec<f64>,
+}
+
+impl Mppi {
+    /// For actions of so many numbers.
+    pub fn new(config: MppiConfig, actions: usize) -> Self {
+        Self { mean: vec![0.0; config.horizon * actions], before: vec![0.0; actions], actions, config }
+    }
+
+    fn sample(&self, rng: &mut Rng) -> Vec<f32> {
+        let MppiConfig { deviation, smoothing, .. } = self.config;
+        let mut before = self.before.clone();
+        let mut sequence = Vec::with_capacity(self.mean.len());
+        for (i, mean) in self.mean.iter().enumerate() {
+            let before = &mut before[i % self.actions];
+            let noisy = mean + deviation * rng::normal(rng);
+            *before = (smoothing * noisy + (1.0 - smoothing) * *before).clamp(-1.0, 1.0);
+            sequence.push(*before as f32);
+        }
+        sequence
+    }
+}
+
+impl Planner for Mppi {
+    fn reset(&mut self) {
+        self.mean.fill(0.0);
+        self.before.fill(0.0);
+    }
+
+    fn plan(&mut self, objective: &mut Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+        let mut promised = f32::NEG_INFINITY;
+        for index in 0..self.config.iterations {
+            let mut candidates = Sequences::new(self.config.horizon, self.actions);
+            for _ in 0..self.config.population {
+                candidates.values.extend(self.sample(rng));
+            }
+            let returns = objective(&candidates);
+            promised = returns.iter().copied().fold(promised, f32::max);
+            let weights = weights(&returns, self.config.temperature * spread(&returns));
+            self.mean.fill(0.0);
+            for (row, weight) in candidates.rows().zip(&weights) {
+                self.mean.iter_mut().zip(row).for_each(|(m, a)| *m += weight * f64::from(*a));
+            }
+            observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &self.mean });
+        }
+        Plan { actions: as_actions(&self.mean), promised }
+    }
+
+    fn shift(&mut self, steps: usize) {
+        let executed = (steps.max(1) - 1) * self.actions;
+        self.before = self.mean[executed..executed + self.actions].to_vec();
+        let last = self.mean[self.mean.len() - self.actions..].to_vec();
+        shifted(&mut self.mean, steps, self.actions, &last);
+    }
+}
+
+/// Weights proportional to exp(return / temperature), summing to one. Not a number weighs nothing.
+fn weights(returns: &[f32], temperature: f64) -> Vec<f64> {
+    let top = returns.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let weigh = |r: &f32| if r.is_nan() { 0.0 } else { (f64::from(r - top) / temperature).exp() };
+    let weights: Vec<f64> = returns.iter().map(weigh).collect();
+    let sum: f64 = weights.iter().sum();
+    weights.iter().map(|w| w / sum).collect()
+}
+
+/// The standard deviation of the returns that are numbers; a little above zero if all are equal.
+fn spread(returns: &[f32]) -> f64 {
+    let known: Vec<f64> = returns.iter().filter(|r| r.is_finite()).map(|r| f64::from(*r)).collect();
+    let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
+    let variance = known.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / known.len().max(1) as f64;
+    variance.sqrt().max(1e-6)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn weights_are_those_of_the_reference() {
+        let returns = [10.0, 9.0, 7.0];
+        for (temperature, expected) in
+            [(1.0, [0.705_384_51, 0.259_496_46, 0.035_119_03]), (2.0, [0.546_549_39, 0.331_498_96, 0.121_951_65])]
+        {
+            for (found, expected) in weights(&returns, temperature).iter().zip(expected) {
+                assert!((found - expected).abs() < 1e-7, "{found}, expected {expected}");
+            }
+        }
+        let mean: f64 = weights(&returns, 1.0).iter().zip([0.2, -0.1, 0.9]).map(|(w, a)| w * a).sum();
+        assert!((mean - 0.146_734_38).abs() < 1e-7);
+    }
+}

@@ -1,0 +1,136 @@
+//! Every planner finds known optima, and none needs to know what it plans for.
+
+use handful::plan::{CemConfig, IcemConfig, Iteration, MppiConfig, Plan, PlannerConfig, Sequences, ShootingConfig};
+use handful::rng;
+
+const HORIZON: usize = 8;
+
+/// The planners that search, each with the distance (largest over all numbers) within which it must come to an
+/// optimum.
+fn planners() -> [(&'static str, PlannerConfig, f32); 3] {
+    let cem = CemConfig { horizon: HORIZON, iterations: 10, ..CemConfig::default() };
+    let icem = IcemConfig { horizon: HORIZON, population: 300, iterations: 8, colour: 1.0, ..IcemConfig::default() };
+    let mppi = MppiConfig {
+        horizon: HORIZON,
+        population: 2000,
+        iterations: 20,
+        smoothing: 1.0,
+        deviation: 0.3,
+        ..MppiConfig::default()
+    };
+    [
+        ("CEM", PlannerConfig::Cem(cem), 0.05),
+        ("iCEM", PlannerConfig::Icem(icem), 0.25),
+        ("MPPI", PlannerConfig::Mppi(mppi), 0.15),
+    ]
+}
+
+/// Minus the squared distance from a target within the bounds.
+fn bowl(candidates: &Sequences, target: &[f32]) -> Vec<f32> {
+    let worth = |row: &[f32]| -row.iter().zip(target).map(|(a, t)| (a - t).powi(2)).sum::<f32>();
+    candidates.rows().map(worth).collect()
+}
+
+fn target() -> Vec<f32> {
+    (0..2 * HORIZON).map(|i| 0.7 * (i as f32 * 0.9).sin()).collect()
+}
+
+fn farthest(plan: &Plan, target: &[f32]) -> f32 {
+    plan.actions.iter().zip(target).map(|(a, t)| (a - t).abs()).fold(0.0, f32::max)
+}
+
+#[test]
+fn planners_find_the_bottom_of_a_bowl() {
+    let target = target();
+    for (name, config, tolerance) in planners() {
+        let mut planner = config.build(2);
+        let mut rng = rng::stream(0, name);
+        let mut iterations = 0;
+        let mut watch = |iteration: &Iteration| {
+            assert_eq!(iteration.index, iterations);
+            assert_eq!(iteration.candidates.count(), iteration.returns.len());
+            assert!(iteration.candidates.values.iter().all(|a| (-1.0..=1.0).contains(a)), "{name}: within bounds");
+            iterations += 1;
+        };
+        let plan = planner.plan(&mut |candidates| bowl(candidates, &target), &mut watch, &mut rng);
+        assert!(iterations > 0);
+        let distance = farthest(&plan, &target);
+        assert!(distance < tolerance, "{name}: {distance} from the optimum");
+    }
+}
+
+#[test]
+fn shooting_takes_the_best_of_what_it_tried() {
+    let target = target();
+    let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 300 });
+    let mut tried = None;
+    let mut watch = |i: &Iteration| tried = Some((i.candidates.clone(), i.returns.to_vec()));
+    let plan = config.build(2).plan(&mut |c| bowl(c, &target), &mut watch, &mut rng::stream(0, "shooting"));
+    let (candidates, returns) = tried.expect("one iteration");
+    assert_eq!(candidates.count(), 300);
+    assert!(returns.iter().all(|r| *r <= plan.promised));
+    assert!(candidates.rows().any(|row| row == plan.actions));
+}
+
+/// An optimum on the bounds, as when full speed is best.
+#[test]
+fn planners_reach_the_bounds() {
+    for (name, config, _) in planners() {
+        let mut planner = config.build(2);
+        let sum = |candidates: &Sequences| candidates.rows().map(|row| row.iter().sum()).collect();
+        let plan = planner.plan(&mut |c| sum(c), &mut |_| {}, &mut rng::stream(1, name));
+        let mean = plan.actions.iter().sum::<f32>() / plan.actions.len() as f32;
+        // CEM's spread vanishes on the way to a bound, so it stops short of it.
+        assert!(mean > 0.8, "{name}: {mean}");
+    }
+}
+
+/// What was found helps the next search: with few samples, a second plan is better than the first.
+#[test]
+fn a_warm_start_helps() {
+    let target: Vec<f32> = vec![0.6; 2 * HORIZON];
+    for (name, config) in [
+        (
+            "CEM",
+            PlannerConfig::Cem(CemConfig { horizon: HORIZON, population: 40, elites: 8, iterations: 2, momentum: 0.1 }),
+        ),
+        (
+            "iCEM",
+            PlannerConfig::Icem(IcemConfig {
+                horizon: HORIZON,
+                population: 30,
+                iterations: 2,
+                ..IcemConfig::default()
+            }),
+        ),
+    ] {
+        let mut planner = config.build(2);
+        let mut rng = rng::stream(2, name);
+        let mut distances = Vec::new();
+        for _ in 0..6 {
+            let plan = planner.plan(&mut |c| bowl(c, &target), &mut |_| {}, &mut rng);
+            distances.push(plan.actions.iter().zip(&target).map(|(a, t)| (a - t).powi(2)).sum::<f32>());
+            planner.shift(1);
+        }
+        assert!(distances[5] < 0.6 * distances[0], "{name}: {distances:?}");
+        planner.reset();
+        let anew = planner.plan(&mut |c| bowl(c, &target), &mut |_| {}, &mut rng);
+        let distance = anew.actions.iter().zip(&target).map(|(a, t)| (a - t).powi(2)).sum::<f32>();
+        assert!(distance > distances[5], "{name}: forgets when it is told to");
+    }
+}
+
+#[test]
+fn not_a_number_is_never_chosen() {
+    let shooting = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 300 });
+    let all = planners().into_iter().chain([("shooting", shooting, 0.0)]);
+    for (name, config, _) in all {
+        let mut planner = config.build(2);
+        let half = |candidates: &Sequences| -> Vec<f32> {
+            candidates.rows().map(|row| if row[0] > 0.0 { f32::NAN } else { row[1] }).collect()
+        };
+        let plan = planner.plan(&mut |c| half(c), &mut |_| {}, &mut rng::stream(3, name));
+        assert!(plan.actions.iter().all(|a| a.is_finite()), "{name}");
+        assert!(plan.actions[0] <= 0.0 && plan.promised.is_finite(), "{name}: {:?}", &plan.actions[..2]);
+    }
+}
