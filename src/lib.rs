@@ -76,7 +76,7 @@ pub mod watch;
 
 /// What most programs that use this crate need.
 pub mod prelude {
-    pub use crate::agent::{Agent, Losses, Mode, Random, Sac, SacConfig, Scripted};
+    pub use crate::agent::{Agent, Losses, Mode, Oracle, OracleConfig, Random, Sac, SacConfig, Scripted, Seat};
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};

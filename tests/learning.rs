@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use handful::agent::{Agent, Mode, Sac, SacConfig};
+use handful::agent::{Agent, Mode, Sac, SacConfig, Seat};
 use handful::env::{Env, Task};
 use handful::error::Error;
 use handful::replay::{ReplayBuffer, Transition};
@@ -41,6 +41,36 @@ fn sac_swings_the_pendulum_up() {
     let mut judge = Judge::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
     let summary = judge.evaluate(&mut agent, 20, Starts::Test).expect("valid actions").summary();
     assert!(summary.return_mean > -250.0, "mean return {}", summary.return_mean);
+}
+
+/// The planner before any model is learned: on the true simulator it must be good.
+#[test]
+fn the_oracle_swings_the_pendulum_up() {
+    let config = RunConfig::new(Task::Pendulum, "oracle", 0, None, None).expect("a preset");
+    let mut judge = Judge::new(|| config.world()).expect("a world");
+    let mut oracle = config.agent().expect("an oracle");
+    let summary = judge.evaluate(oracle.as_mut(), 6, Starts::Test).expect("valid actions").summary();
+    assert!(summary.return_mean > -200.0, "mean return {}", summary.return_mean);
+    assert_eq!(summary.success, 1.0, "upright at the end, always");
+}
+
+/// Planning on the simulator must leave the world in which the agent acts as it was.
+#[test]
+fn the_oracle_does_not_disturb_the_world() {
+    let mut world = Task::Reach.make();
+    let obs = world.reset(0);
+    let mut untouched = Task::Reach.make();
+    untouched.reset(0);
+    let config = RunConfig::new(Task::Reach, "oracle", 0, None, None).expect("a preset");
+    let mut oracle = config.agent().expect("an oracle");
+    let mut first = true;
+    for _ in 0..3 {
+        let seat = Seat { number: 0, first, obs: &obs, world: &world };
+        let action = oracle.act_all(&[seat]).remove(0);
+        let (a, b) = (world.step(&action).expect("valid"), untouched.step(&action).expect("valid"));
+        assert_eq!(a.observation, b.observation);
+        first = false;
+    }
 }
 
 fn transition(number: f32, truncated: bool) -> Transition {

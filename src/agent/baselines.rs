@@ -1,11 +1,9 @@
 //! Agents that do not learn: the floor, and what a person would write.
 
-use super::{Agent, Losses, Mode};
+use super::{Agent, Mode};
 use crate::env::tabletop::{ObservationKind, TableOptions};
 use crate::env::{Spec, Task};
 use crate::error::{Error, Result};
-use crate::nn::Weights;
-use crate::replay::Transition;
 use crate::rng::{self, Rng};
 
 /// Uniform random actions.
@@ -48,29 +46,31 @@ impl Scripted {
 /// What there is to say of an agent that never learns.
 macro_rules! never_learns {
     () => {
-        fn observe(&mut self, _transition: &Transition) {}
+        fn observe(&mut self, _transition: &crate::replay::Transition) {}
 
-        fn update(&mut self) -> Option<Losses> {
+        fn update(&mut self) -> Option<crate::agent::Losses> {
             None
         }
 
-        fn weights(&self) -> Weights {
-            Weights::default()
+        fn weights(&self) -> crate::nn::Weights {
+            crate::nn::Weights::default()
         }
 
-        fn load_weights(&mut self, _weights: &Weights) -> Result<()> {
+        fn load_weights(&mut self, _weights: &crate::nn::Weights) -> crate::error::Result<()> {
             Ok(())
         }
 
-        fn training_state(&self) -> Weights {
-            Weights::default()
+        fn training_state(&self) -> crate::nn::Weights {
+            crate::nn::Weights::default()
         }
 
-        fn load_training_state(&mut self, _state: &Weights) -> Result<()> {
+        fn load_training_state(&mut self, _state: &crate::nn::Weights) -> crate::error::Result<()> {
             Ok(())
         }
     };
 }
+
+pub(super) use never_learns;
 
 impl Agent for Random {
     fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {

@@ -1,13 +1,16 @@
 //! Agents: wiring of models, planners and networks behind one small interface.
 
 mod baselines;
+mod oracle;
 mod sac;
 
 pub use baselines::{Random, Scripted};
+pub use oracle::{Oracle, OracleConfig};
 pub use sac::{Sac, SacConfig};
 
 use std::collections::BTreeMap;
 
+use crate::env::World;
 use crate::error::Result;
 use crate::nn::Weights;
 use crate::replay::Transition;
@@ -24,15 +27,28 @@ pub enum Mode {
 /// Named numbers that an update reports: losses, entropies, norms.
 pub type Losses = BTreeMap<&'static str, f32>;
 
+/// A place from which an agent acts in an evaluation: one of several worlds side by side.
+#[derive(Clone, Copy)]
+pub struct Seat<'a> {
+    /// Its number; it stays the same through an episode.
+    pub number: usize,
+    /// Whether this is the first step of an episode.
+    pub first: bool,
+    /// What is observed.
+    pub obs: &'a [f32],
+    /// The world itself. Only an oracle looks at it.
+    pub world: &'a World,
+}
+
 /// Something that acts and learns.
 pub trait Agent: Send {
     /// Chooses an action, each number in [-1, 1].
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32>;
 
-    /// Actions for many observations at once, in [`Mode::Evaluate`]. Networks answer for all of them
-    /// in one pass.
-    fn act_batch(&mut self, observations: &[&[f32]]) -> Vec<Vec<f32>> {
-        observations.iter().map(|obs| self.act(obs, Mode::Evaluate)).collect()
+    /// Actions in many worlds at once, in [`Mode::Evaluate`]. Networks answer for all of them in one
+    /// pass; agents with a memory keep one for each seat.
+    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
+        seats.iter().map(|seat| self.act(seat.obs, Mode::Evaluate)).collect()
     }
 
     /// Takes in one step of experience.

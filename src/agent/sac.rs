@@ -12,7 +12,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use super::{Agent, Losses, Mode};
+use super::{Agent, Losses, Mode, Seat};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::ops;
@@ -222,6 +222,13 @@ impl Sac {
         ])
     }
 
+    /// The policy's best action for each row of observations.
+    fn modes(&self, observations: &[f32]) -> Vec<Vec<f32>> {
+        let head = self.policy.forward(self.observations(observations), Learning::Frozen);
+        let actions = SquashedGaussian::from_head(head).mode();
+        values(&actions).chunks(self.actions).map(<[f32]>::to_vec).collect()
+    }
+
     /// Observations as the networks see them, `[1, rows, observation]`.
     fn observations(&self, raw: &[f32]) -> Tensor3 {
         let size = self.centre.len();
@@ -244,7 +251,7 @@ impl Sac {
 impl Agent for Sac {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         if mode == Mode::Evaluate {
-            return self.act_batch(&[obs]).remove(0);
+            return self.modes(obs).remove(0);
         }
         if self.observed < self.config.warm_up {
             return (0..self.actions).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect();
@@ -255,10 +262,9 @@ impl Agent for Sac {
         values(&action).to_vec()
     }
 
-    fn act_batch(&mut self, observations: &[&[f32]]) -> Vec<Vec<f32>> {
-        let head = self.policy.forward(self.observations(&observations.concat()), Learning::Frozen);
-        let actions = SquashedGaussian::from_head(head).mode();
-        values(&actions).chunks(self.actions).map(<[f32]>::to_vec).collect()
+    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
+        let observations: Vec<&[f32]> = seats.iter().map(|seat| seat.obs).collect();
+        self.modes(&observations.concat())
     }
 
     fn observe(&mut self, transition: &Transition) {

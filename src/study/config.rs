@@ -5,16 +5,17 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::agent::{Agent, Random, Sac, SacConfig, Scripted};
+use crate::agent::{Agent, Oracle, OracleConfig, Random, Sac, SacConfig, Scripted};
 use crate::env::tabletop::TableOptions;
 use crate::env::{Env, Task, World};
 use crate::error::{Error, Result};
 
 /// The presets that come with the crate: the methods that the command line knows. A preset's table
 /// `for.TASK` holds what differs for that task.
-const PRESETS: [(&str, &str); 4] = [
+const PRESETS: [(&str, &str); 5] = [
     ("random", include_str!("../../data/presets/random.toml")),
     ("scripted", include_str!("../../data/presets/scripted.toml")),
+    ("oracle", include_str!("../../data/presets/oracle.toml")),
     ("sac", include_str!("../../data/presets/sac.toml")),
     ("debug", include_str!("../../data/presets/debug.toml")),
 ];
@@ -32,6 +33,8 @@ pub enum AgentKind {
     Random,
     /// [`Scripted`].
     Scripted,
+    /// [`Oracle`].
+    Oracle,
     /// [`Sac`].
     Sac,
 }
@@ -62,6 +65,9 @@ pub struct RunConfig {
     /// Options of the environment.
     #[serde(default)]
     pub env: TableOptions,
+    /// Settings of the oracle, for agents of that kind.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub oracle: Option<OracleConfig>,
     /// Settings of SAC, for agents of that kind.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sac: Option<SacConfig>,
@@ -159,6 +165,9 @@ impl RunConfig {
         Ok(match self.agent {
             AgentKind::Random => Box::new(Random::new(world.spec(), self.seed)),
             AgentKind::Scripted => Box::new(Scripted::new(self.task, self.env)?),
+            AgentKind::Oracle => {
+                Box::new(Oracle::new(self.task, self.env, self.oracle.clone().unwrap_or_default(), self.seed)?)
+            }
             AgentKind::Sac => Box::new(Sac::new(world.spec(), self.sac.clone().unwrap_or_default(), self.seed)?),
         })
     }

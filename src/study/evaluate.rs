@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::smoothness;
 use super::statistics::{deviation, mean, wilson};
-use crate::agent::Agent;
+use crate::agent::{Agent, Seat};
 use crate::env::vector::VectorEnv;
 use crate::env::{Env, World};
 use crate::error::{Error, Result};
@@ -147,13 +147,18 @@ impl Judge {
         let blank = Episode { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
         let mut episodes = vec![blank; seeds.len()];
         let mut running: Vec<usize> = (0..seeds.len()).collect();
-        *action_ms = time_of_action(agent, &observations[0]);
+        let seat = Seat { number: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
+        *action_ms = time_of_action(agent, seat);
+        let mut first = true;
         while !running.is_empty() {
-            let seen: Vec<&[f32]> = running.iter().map(|&i| observations[i].as_slice()).collect();
+            let envs = self.worlds.envs();
+            let seats = running.iter().map(|&i| Seat { number: i, first, obs: &observations[i], world: &envs[i] });
+            let seats: Vec<Seat> = seats.collect();
             let mut actions = vec![None; seeds.len()];
-            for (&i, action) in running.iter().zip(agent.act_batch(&seen)) {
+            for (&i, action) in running.iter().zip(agent.act_all(&seats)) {
                 actions[i] = Some(action);
             }
+            first = false;
             for (i, step) in self.worlds.step(&actions)?.into_iter().enumerate() {
                 let Some(step) = step else { continue };
                 let episode = &mut episodes[i];
@@ -178,11 +183,11 @@ impl Judge {
 }
 
 /// Milliseconds that one action takes: the median of a few.
-fn time_of_action(agent: &mut dyn Agent, obs: &[f32]) -> f64 {
+fn time_of_action(agent: &mut dyn Agent, seat: Seat) -> f64 {
     let mut times: Vec<f64> = (0..5)
         .map(|_| {
             let start = Instant::now();
-            std::hint::black_box(agent.act_batch(&[obs]));
+            std::hint::black_box(agent.act_all(&[seat]));
             start.elapsed().as_secs_f64() * 1e3
         })
         .collect();

@@ -5,8 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::agent::Agent;
-use crate::agent::Mode;
+use crate::agent::{Agent, Seat};
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
 use crate::env::scene::Body;
 use crate::env::{Env, World};
@@ -71,7 +70,8 @@ impl Recording {
         let rest = vec![0.0; world.spec().action_size];
         let mut frames = vec![Frame { poses: poses(world), reward: 0.0, success: false, action: rest }];
         loop {
-            let action = agent.act(&obs, Mode::Evaluate);
+            let seat = Seat { number: 0, first: frames.len() == 1, obs: &obs, world };
+            let action = agent.act_all(&[seat]).remove(0);
             let step = world.step(&action)?;
             frames.push(Frame { poses: poses(world), reward: step.reward, success: step.success, action });
             if step.done() {

@@ -1,0 +1,112 @@
+//! The oracle: a planner on the true simulator.
+//!
+//! It is not an agent that anyone could have (it tries things out in the very world in which it acts, and puts the
+//! world back), but the upper bound for all that plan in a world that they have learned: what remains between
+//! such an agent and the oracle is the model's fault, not the planner's.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::baselines::never_learns;
+use super::{Agent, Mode, Seat};
+use crate::env::tabletop::TableOptions;
+use crate::env::{Env, Snapshot, Task, World, WorldState};
+use crate::error::{Error, Result};
+use crate::plan::{IcemConfig, Planner, PlannerConfig, Sequences};
+use crate::rng::{self, Rng};
+
+/// Settings of [`Oracle`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OracleConfig {
+    /// The planner and its settings.
+    pub planner: PlannerConfig,
+    /// Each action of a plan is held for so many control steps: it looks farther ahead for the same number of
+    /// decisions.
+    pub hold: usize,
+}
+
+impl Default for OracleConfig {
+    fn default() -> Self {
+        Self { planner: PlannerConfig::Icem(IcemConfig::default()), hold: 1 }
+    }
+}
+
+/// A planner for each seat, and worlds to try things out in.
+pub struct Oracle {
+    config: OracleConfig,
+    actions: usize,
+    planners: BTreeMap<usize, Box<dyn Planner>>,
+    /// One for each thread.
+    worlds: Vec<World>,
+    rng: Rng,
+}
+
+impl Oracle {
+    /// An oracle for a task.
+    ///
+    /// # Errors
+    /// If a setting cannot be used.
+    pub fn new(task: Task, options: TableOptions, config: OracleConfig, seed: u64) -> Result<Self> {
+        if config.hold == 0 || config.planner.horizon() < 2 {
+            return Err(Error::BadSetting("oracle: `hold` must be at least 1, and a horizon at least 2".into()));
+        }
+        let worlds = (0..rayon::current_num_threads()).map(|_| task.make_with(options)).collect::<Result<Vec<_>>>()?;
+        let actions = worlds[0].spec().action_size;
+        Ok(Self { config, actions, planners: BTreeMap::new(), worlds, rng: rng::stream(seed, "oracle") })
+    }
+
+    fn plan(&mut self, seat: &Seat) -> Vec<f32> {
+        let Self { config, actions, planners, worlds, rng } = self;
+        let planner = planners.entry(seat.number).or_insert_with(|| config.planner.build(*actions));
+        if seat.first {
+            planner.reset();
+        }
+        let state = seat.world.snapshot();
+        let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates, config.hold);
+        let plan = planner.plan(&mut objective, &mut |_| {}, rng);
+        planner.shift(1);
+        plan.actions[..*actions].to_vec()
+    }
+}
+
+/// The return of each sequence, tried out from `state`, the work shared out over the worlds.
+fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences, hold: usize) -> Vec<f32> {
+    let share = candidates.count().div_ceil(worlds.len());
+    let mut returns = vec![0.0; candidates.count()];
+    let shares = returns.par_chunks_mut(share).zip(worlds).enumerate();
+    shares.for_each(|(part, (returns, world))| {
+        for (i, total) in returns.iter_mut().enumerate() {
+            world.restore(state);
+            'sequence: for action in candidates.row(part * share + i).chunks(candidates.actions) {
+                for _ in 0..hold {
+                    let Ok(step) = world.step(action) else {
+                        *total = f32::NAN;
+                        break 'sequence;
+                    };
+                    *total += step.reward;
+                    if step.terminated {
+                        break 'sequence;
+                    }
+                }
+            }
+        }
+    });
+    returns
+}
+
+impl Agent for Oracle {
+    /// # Panics
+    /// Always: an oracle needs the world, which [`Agent::act_all`] shows it.
+    fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
+        panic!("an oracle acts from a seat in a world, not on an observation")
+    }
+
+    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
+        seats.iter().map(|seat| self.plan(seat)).collect()
+    }
+
+    never_learns!();
+}
