@@ -165,6 +165,10 @@ fn a_folder_with_another_run_is_left_alone() {
     let before = std::fs::read(folder.path().join("config.toml")).expect("a config");
     let Err(problem) = Run::open(debug_run(4), folder.path()) else { panic!("another seed is another run") };
     assert!(problem.to_string().contains("`seed` is 3, not 4"), "{problem}");
+    let mut other = debug_run(3);
+    other.sac.as_mut().expect("SAC's settings").discount = 0.5;
+    let Err(problem) = Run::open(other, folder.path()) else { panic!("another discount is another run") };
+    assert!(problem.to_string().contains("`sac.discount` is "), "{problem}");
     assert_eq!(std::fs::read(folder.path().join("config.toml")).expect("a config"), before);
 }
 

@@ -43,11 +43,8 @@ impl Adam {
         Self { config, steps: 0, moments: BTreeMap::new() }
     }
 
-    /// One step against `gradients`. Returns the norm of the gradients before clipping.
-    ///
-    /// # Panics
-    /// If a parameter has no gradient because nothing that was differentiated depends on it, it is
-    /// taken as zero; this never panics for parameters of the module that was differentiated.
+    /// One step against `gradients`. Returns their norm before clipping. A parameter on which nothing that was
+    /// differentiated depends has a gradient of zero.
     pub fn step(&mut self, module: &mut impl Parameters, gradients: &mut Gradients<f32, Cpu>) -> f32 {
         let squares = module.parameters().into_iter().map(|(_, parameter)| {
             let gradient = gradients.get_or_alloc_mut(parameter).expect("memory for a gradient");

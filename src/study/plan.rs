@@ -138,8 +138,9 @@ pub fn carry_out_all(
                     }
                     let index = runs.iter().position(|(_, other)| other == folder).expect("a run of this study");
                     if let Err(error) = pool.install(|| carry_out(index, config, folder, observer, stop)) {
-                        stop.store(true, Ordering::Relaxed);
+                        // First the reason, then the signal: the others will answer that they were interrupted.
                         failure.lock().expect("no panic holds it").get_or_insert(error);
+                        stop.store(true, Ordering::Relaxed);
                         return;
                     }
                 }

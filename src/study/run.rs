@@ -344,12 +344,21 @@ fn load(path: &Path, agent: &mut dyn Agent) -> Result<Progress> {
 /// The first setting in which two configurations differ.
 fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
     let [there, wanted] = [there, wanted].map(|c| toml::Table::try_from(c).expect("a configuration is TOML"));
-    let keys = there.keys().chain(wanted.keys());
-    let mut keys = keys.filter(|key| there.get(*key) != wanted.get(*key));
-    keys.next().map(|key| {
-        let show = |table: &toml::Table| table.get(key).map_or("nothing".into(), ToString::to_string);
-        format!("its `{key}` is {}, not {}", show(&there), show(&wanted))
-    })
+    difference_in("", &there, &wanted)
+}
+
+fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
+    let key = there.keys().chain(wanted.keys()).find(|key| there.get(*key) != wanted.get(*key))?;
+    let name = format!("{path}{key}");
+    match (there.get(key), wanted.get(key)) {
+        (Some(toml::Value::Table(there)), Some(toml::Value::Table(wanted))) => {
+            difference_in(&format!("{name}."), there, wanted)
+        }
+        (there, wanted) => {
+            let show = |value: Option<&toml::Value>| value.map_or("nothing".into(), ToString::to_string);
+            Some(format!("its `{name}` is {}, not {}", show(there), show(wanted)))
+        }
+    }
 }
 
 fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
