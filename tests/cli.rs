@@ -140,13 +140,16 @@ fn ctrl_c_leaves_a_run_that_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let here = folder.path();
     let train = ["train", "--task", "reach", "--method", "debug", "--steps", "20000", "--out", "run"];
-    let child = Command::new(env!("CARGO_BIN_EXE_handful"))
-        .current_dir(here)
-        .args(train)
-        .stderr(Stdio::piped())
-        .stdout(Stdio::null())
-        .spawn()
-        .expect("the program starts");
+    let start = || {
+        Command::new(env!("CARGO_BIN_EXE_handful"))
+            .current_dir(here)
+            .args(train)
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("the program starts")
+    };
+    let child = start();
     std::thread::sleep(Duration::from_secs(4));
     let kill = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
     assert!(kill.success());
@@ -159,13 +162,7 @@ fn ctrl_c_leaves_a_run_that_resumes() {
     assert!(done > 0, "{said}");
 
     // Going on for a moment is enough to see that it starts from there.
-    let mut child = Command::new(env!("CARGO_BIN_EXE_handful"))
-        .current_dir(here)
-        .args(train)
-        .stderr(Stdio::piped())
-        .stdout(Stdio::null())
-        .spawn()
-        .expect("the program starts");
+    let mut child = start();
     std::thread::sleep(Duration::from_secs(2));
     child.kill().expect("it still runs");
     let said = text(&child.wait_with_output().expect("the program ends").stderr);

@@ -23,14 +23,11 @@ use crate::rng::{self, Rng};
 pub struct OracleConfig {
     /// The planner and its settings.
     pub planner: PlannerConfig,
-    /// Each action of a plan is held for so many control steps: it looks farther ahead for the same number of
-    /// decisions.
-    pub hold: usize,
 }
 
 impl Default for OracleConfig {
     fn default() -> Self {
-        Self { planner: PlannerConfig::Icem(IcemConfig::default()), hold: 1 }
+        Self { planner: PlannerConfig::Icem(IcemConfig::default()) }
     }
 }
 
@@ -50,8 +47,8 @@ impl Oracle {
     /// # Errors
     /// If a setting cannot be used.
     pub fn new(task: Task, options: TableOptions, config: OracleConfig, seed: u64) -> Result<Self> {
-        if config.hold == 0 || config.planner.horizon() < 2 {
-            return Err(Error::BadSetting("oracle: `hold` must be at least 1, and a horizon at least 2".into()));
+        if config.planner.horizon() < 2 {
+            return Err(Error::BadSetting("oracle: a planner's horizon must be at least 2".into()));
         }
         let worlds = (0..rayon::current_num_threads()).map(|_| task.make_with(options)).collect::<Result<Vec<_>>>()?;
         let actions = worlds[0].spec().action_size;
@@ -65,7 +62,7 @@ impl Oracle {
             planner.reset();
         }
         let state = seat.world.snapshot();
-        let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates, config.hold);
+        let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates);
         let plan = planner.plan(&mut objective, &mut |_| {}, rng);
         planner.shift(1);
         plan.actions[..*actions].to_vec()
@@ -73,23 +70,21 @@ impl Oracle {
 }
 
 /// The return of each sequence, tried out from `state`, the work shared out over the worlds.
-fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences, hold: usize) -> Vec<f32> {
+fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences) -> Vec<f32> {
     let share = candidates.count().div_ceil(worlds.len());
     let mut returns = vec![0.0; candidates.count()];
     let shares = returns.par_chunks_mut(share).zip(worlds).enumerate();
     shares.for_each(|(part, (returns, world))| {
         for (i, total) in returns.iter_mut().enumerate() {
             world.restore(state);
-            'sequence: for action in candidates.row(part * share + i).chunks(candidates.actions) {
-                for _ in 0..hold {
-                    let Ok(step) = world.step(action) else {
-                        *total = f32::NAN;
-                        break 'sequence;
-                    };
-                    *total += step.reward;
-                    if step.terminated {
-                        break 'sequence;
-                    }
+            for action in candidates.row(part * share + i).chunks(candidates.actions) {
+                let Ok(step) = world.step(action) else {
+                    *total = f32::NAN;
+                    break;
+                };
+                *total += step.reward;
+                if step.terminated {
+                    break;
                 }
             }
         }

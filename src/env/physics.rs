@@ -345,11 +345,6 @@ impl Physics {
         self.contact_force(a.collider, b.collider) > 0.0
     }
 
-    /// Force with which `object` presses on the table, N.
-    pub fn table_force(&self, object: Object) -> f64 {
-        self.contact_force(self.table, object.collider)
-    }
-
     /// Normal force between two colliders in the last step, N. (rapier lists pairs that are merely
     /// close as well; those carry no impulse.)
     fn contact_force(&self, a: ColliderHandle, b: ColliderHandle) -> f64 {
