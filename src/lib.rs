@@ -7,7 +7,8 @@
 //! | 3 | [`study`] | runs, the protocol by which agents are judged, tables, figures, reports |
 //! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
 //! | 2 | [`agent`] | agents: the wiring of what stands below |
-//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI: optimisers of a closure over action sequences |
+//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradients: optimisers of a closure over action sequences |
+//! | 1 | [`model`] | what was learned of the world: probabilistic ensembles, and imagination in them |
 //! | 1 | [`replay`] | what was experienced |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
 //! | 0 | [`env`](mod@env) | worlds to act in: the arm at its table, pendulum, cart-pole |
@@ -67,6 +68,7 @@ pub mod agent;
 pub mod env;
 pub mod error;
 pub mod files;
+pub mod model;
 pub mod nn;
 pub mod plan;
 pub mod replay;
@@ -76,7 +78,7 @@ pub mod watch;
 
 /// What most programs that use this crate need.
 pub mod prelude {
-    pub use crate::agent::{Agent, Losses, Mode, Oracle, OracleConfig, Random, Sac, SacConfig, Scripted, Seat};
+    pub use crate::agent::{Agent, Losses, Mode, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted, Seat};
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};

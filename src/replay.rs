@@ -25,6 +25,21 @@ pub struct Transition {
     pub truncated: bool,
 }
 
+/// A transition as the buffer holds it.
+#[derive(Clone, Copy, Debug)]
+pub struct Row<'a> {
+    /// The observation before the step.
+    pub obs: &'a [f32],
+    /// The action.
+    pub action: &'a [f32],
+    /// The reward.
+    pub reward: f32,
+    /// The observation after the step.
+    pub next_obs: &'a [f32],
+    /// Whether the task ended.
+    pub terminated: bool,
+}
+
 /// A minibatch: `size` rows in each field, one after the other.
 #[derive(Clone, Debug, Default)]
 pub struct Batch {
@@ -93,23 +108,32 @@ impl ReplayBuffer {
         self.next = (self.next + 1) % self.capacity;
     }
 
+    /// The `i`th transition in memory; once the buffer is full, that is not the order of time.
+    ///
+    /// # Panics
+    /// If there are not so many.
+    pub fn row(&self, i: usize) -> Row<'_> {
+        let width = self.width();
+        let (obs, rest) = self.rows[i * width..][..width].split_at(self.observation_size);
+        let (action, rest) = rest.split_at(self.action_size);
+        let (reward, next_obs, terminated) = (rest[0], &rest[1..=self.observation_size], rest[rest.len() - 1] > 0.5);
+        Row { obs, action, reward, next_obs, terminated }
+    }
+
     /// Draws `size` transitions uniformly, with replacement.
     ///
     /// # Panics
     /// If the buffer is empty.
     pub fn sample(&self, size: usize, rng: &mut Rng) -> Batch {
         assert!(!self.is_empty(), "something to draw from");
-        let (obs, action, width) = (self.observation_size, self.action_size, self.width());
         let mut batch = Batch { size, ..Batch::default() };
         for _ in 0..size {
-            let row = &self.rows[rng.random_range(0..self.len()) * width..][..width];
-            let (before, rest) = row.split_at(obs);
-            let (act, rest) = rest.split_at(action);
-            batch.obs.extend(before);
-            batch.actions.extend(act);
-            batch.rewards.push(rest[0]);
-            batch.next_obs.extend(&rest[1..=obs]);
-            batch.terminated.push(rest[obs + 1]);
+            let row = self.row(rng.random_range(0..self.len()));
+            batch.obs.extend(row.obs);
+            batch.actions.extend(row.action);
+            batch.rewards.push(row.reward);
+            batch.next_obs.extend(row.next_obs);
+            batch.terminated.push(f32::from(row.terminated));
         }
         batch
     }

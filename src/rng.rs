@@ -25,6 +25,21 @@ pub fn normal(rng: &mut Rng) -> f64 {
     rng.sample(rand_distr::StandardNormal)
 }
 
+/// A standard normal number, drawn again until it lies within two standard deviations.
+pub fn truncated_normal(rng: &mut Rng) -> f64 {
+    loop {
+        let z = normal(rng);
+        if z.abs() <= 2.0 {
+            return z;
+        }
+    }
+}
+
+/// A generator of its own, whose numbers follow from one drawn here.
+pub fn fork(rng: &mut Rng) -> Rng {
+    Rng::seed_from_u64(rng.random())
+}
+
 /// The generator's state, to be saved.
 pub fn state(rng: &Rng) -> [u64; 4] {
     let json = serde_json::to_value(rng).expect("a generator serialises");

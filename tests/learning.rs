@@ -5,6 +5,8 @@ use std::path::Path;
 use handful::agent::{Agent, Mode, Sac, SacConfig, Seat};
 use handful::env::{Env, Task};
 use handful::error::Error;
+use handful::model::EnsembleConfig;
+use handful::plan::{IcemConfig, PlannerConfig};
 use handful::replay::{ReplayBuffer, Transition};
 use handful::rng;
 use handful::study::config::RunConfig;
@@ -41,6 +43,39 @@ fn sac_swings_the_pendulum_up() {
     let mut judge = Judge::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
     let summary = judge.evaluate(&mut agent, 20, Starts::Test).expect("valid actions").summary();
     assert!(summary.return_mean > -250.0, "mean return {}", summary.return_mean);
+}
+
+/// After one random episode the model is good enough to plan in: the next return comes close to the oracle's.
+#[test]
+fn pets_swings_the_pendulum_up_after_one_random_episode() {
+    let config = RunConfig::new(Task::Pendulum, "pets", 0, None, None).expect("a preset");
+    let mut env = config.world().expect("a world");
+    let mut agent = config.agent().expect("an agent");
+    let mut returns = [0.0; 2];
+    for (episode, total) in returns.iter_mut().enumerate() {
+        // The second episode begins hanging down and at rest, near enough: the best return from there is about -120.
+        let mut obs = env.reset([0, 9][episode]);
+        loop {
+            let action = agent.act(&obs, Mode::Explore);
+            let outcome = env.step(&action).expect("a valid action");
+            *total += outcome.reward;
+            agent.observe(&Transition {
+                obs,
+                action,
+                reward: outcome.reward,
+                next_obs: outcome.observation.clone(),
+                terminated: outcome.terminated,
+                truncated: outcome.truncated,
+            });
+            agent.update();
+            if outcome.done() {
+                break;
+            }
+            obs = outcome.observation;
+        }
+    }
+    assert!(returns[0] < -500.0, "random actions do not swing it up: {returns:?}");
+    assert!(returns[1] > -300.0, "planning does: {returns:?}");
 }
 
 /// The planner before any model is learned: on the true simulator it must be good.
@@ -100,8 +135,20 @@ fn the_replay_buffer_is_a_ring_and_keeps_truncated_futures() {
     }
 }
 
+/// SAC shrunk to seconds.
 fn debug_run(seed: u64) -> RunConfig {
     RunConfig::new(Task::Reach, "debug", seed, None, None).expect("a preset")
+}
+
+/// PETS shrunk to seconds.
+fn small_pets(seed: u64) -> RunConfig {
+    let mut config = RunConfig::new(Task::Reach, "pets", seed, Some(600), None).expect("a preset");
+    (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
+    let pets = config.pets.as_mut().expect("PETS's settings");
+    pets.warm_up = 200;
+    pets.ensemble = EnsembleConfig { hidden: vec![16], first_steps: 50, steps: 20, check_every: 10, ..pets.ensemble.clone() };
+    pets.planner = PlannerConfig::Icem(IcemConfig { horizon: 4, population: 10, elites: 4, iterations: 2, ..IcemConfig::default() });
+    config
 }
 
 fn finish(run: &mut Run) {
@@ -121,11 +168,21 @@ fn without_times(path: &Path) -> String {
 
 #[test]
 fn a_resumed_run_ends_as_if_it_had_never_stopped() {
+    ends_as_if_it_had_never_stopped(&debug_run(1), &["episodes.csv", "evaluations.csv", "losses.csv", "test.csv"]);
+}
+
+#[test]
+fn so_does_one_that_plans() {
+    let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "test.csv"];
+    ends_as_if_it_had_never_stopped(&small_pets(1), &files);
+}
+
+fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {
     let folder = tempfile::tempdir().expect("a folder");
     let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
-    finish(&mut Run::open(debug_run(1), &whole).expect("a new run"));
+    finish(&mut Run::open(config.clone(), &whole).expect("a new run"));
     {
-        let mut run = Run::open(debug_run(1), &halves).expect("a new run");
+        let mut run = Run::open(config.clone(), &halves).expect("a new run");
         while run.steps_done() < 300 || !run.between_episodes() {
             run.step().expect("a healthy run");
         }
@@ -133,10 +190,10 @@ fn a_resumed_run_ends_as_if_it_had_never_stopped() {
         // What happens after the save is lost, as in a crash.
         (0..150).for_each(|_| drop(run.step().expect("a healthy run")));
     }
-    let mut run = Run::open(debug_run(1), &halves).expect("a run to go on with");
+    let mut run = Run::open(config.clone(), &halves).expect("a run to go on with");
     assert_eq!(run.steps_done(), 300);
     finish(&mut run);
-    for file in ["episodes.csv", "evaluations.csv", "losses.csv", "test.csv"] {
+    for file in files {
         assert_eq!(without_times(&whole.join(file)), without_times(&halves.join(file)), "{file}");
     }
     let bytes = |folder: &Path| std::fs::read(folder.join("weights.safetensors")).expect("weights");

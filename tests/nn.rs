@@ -4,7 +4,7 @@
 use dfdx::prelude::*;
 use handful::nn::kernels::{self, DenseShape, Matrix};
 use handful::nn::{
-    Activation, Adam, AdamConfig, Learning, Mlp, MlpConfig, Parameters, SquashedGaussian, Tensor3, Weights,
+    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Parameters, SquashedGaussian, Tensor3, Weights,
     copy_parameters, device, ops, polyak, tensor, values,
 };
 use handful::rng::{self, Rng};
@@ -89,7 +89,7 @@ fn a_layer_does_not_depend_on_the_number_of_threads() {
 #[test]
 fn gradients_of_a_dense_layer() {
     let mut rng = rng::stream(1, "dense");
-    for (x_members, activation) in [(1, Activation::Identity), (3, Activation::Identity), (3, Activation::Relu)] {
+    for (x_members, activation) in [(1, Activation::Identity), (3, Activation::Identity), (3, Activation::Relu), (3, Activation::Silu)] {
         let inputs =
             vec![random((x_members, 7, 5), &mut rng), random((3, 5, 4), &mut rng), random((3, 1, 4), &mut rng)];
         let weights = random((3, 7, 4), &mut rng);
@@ -109,19 +109,20 @@ fn gradients_of_a_dense_layer() {
 #[test]
 fn gradients_of_layer_normalisation() {
     let mut rng = rng::stream(2, "norm");
-    let inputs = vec![random((2, 6, 9), &mut rng), random((2, 1, 9), &mut rng), random((2, 1, 9), &mut rng)];
-    let weights = random((2, 6, 9), &mut rng);
-    check_gradients(inputs, |inputs, taped| {
-        let [x, gain, shift] = inputs else { unreachable!() };
-        let identity = Activation::Identity;
-        if taped {
-            let y = ops::layer_norm(x.clone().leaky_traced(), gain, shift, identity, Learning::Trained);
-            let loss = scalar(y, &weights);
-            (loss.array(), Some(loss.backward()))
-        } else {
-            (scalar(ops::layer_norm(x.clone(), gain, shift, identity, Learning::Trained), &weights).array(), None)
-        }
-    });
+    for activation in [Activation::Identity, Activation::Silu] {
+        let inputs = vec![random((2, 6, 9), &mut rng), random((2, 1, 9), &mut rng), random((2, 1, 9), &mut rng)];
+        let weights = random((2, 6, 9), &mut rng);
+        check_gradients(inputs, |inputs, taped| {
+            let [x, gain, shift] = inputs else { unreachable!() };
+            if taped {
+                let y = ops::layer_norm(x.clone().leaky_traced(), gain, shift, activation, Learning::Trained);
+                let loss = scalar(y, &weights);
+                (loss.array(), Some(loss.backward()))
+            } else {
+                (scalar(ops::layer_norm(x.clone(), gain, shift, activation, Learning::Trained), &weights).array(), None)
+            }
+        });
+    }
 }
 
 #[test]
@@ -205,7 +206,15 @@ fn log_std_stays_in_its_range_with_a_gradient() {
 }
 
 fn network(members: usize, layer_norm: bool, seed: u64) -> Mlp {
-    let config = MlpConfig { members, input: 3, hidden: vec![16, 16], output: 2, layer_norm };
+    let config = MlpConfig {
+        members,
+        input: 3,
+        hidden: vec![16, 16],
+        output: 2,
+        layer_norm,
+        activation: Activation::Relu,
+        init: Init::Uniform,
+    };
     Mlp::new(&device(), &config, &mut rng::stream(seed, "network"))
 }
 

@@ -1,9 +1,72 @@
 //! Every planner finds known optima, and none needs to know what it plans for.
 
-use handful::plan::{CemConfig, IcemConfig, Iteration, MppiConfig, Plan, PlannerConfig, Sequences, ShootingConfig};
+use handful::plan::{
+    CemConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig, Objective, Plan, PlannerConfig,
+    RecedingHorizon, Sequences, ShootingConfig,
+};
 use handful::rng;
 
 const HORIZON: usize = 8;
+
+/// The planners that climb, and know their slopes only by differences.
+fn climbers() -> [(&'static str, PlannerConfig); 2] {
+    let gradient = GradientConfig { horizon: HORIZON, iterations: 60, rate: 0.05, ..GradientConfig::default() };
+    let icem = IcemConfig { horizon: HORIZON, population: 60, ..IcemConfig::default() };
+    [
+        ("gradient", PlannerConfig::Gradient(gradient)),
+        ("hybrid", PlannerConfig::Hybrid(HybridConfig { icem, iterations: 60, rate: 0.05 })),
+    ]
+}
+
+#[test]
+fn climbers_find_the_bottom_of_a_bowl() {
+    let target = target();
+    for (name, config) in climbers() {
+        let plan = config.build(2).plan(&mut |c: &Sequences| bowl(c, &target), &mut |_| {}, &mut rng::stream(0, name));
+        let distance = farthest(&plan, &target);
+        assert!(distance < 0.05, "{name}: {distance} from the optimum");
+    }
+}
+
+/// A slope that leads astray: the hybrid keeps what iCEM found.
+#[test]
+fn the_hybrid_trusts_no_slope_that_does_not_keep_its_word() {
+    struct Liar(Vec<f32>);
+    impl Objective for Liar {
+        fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+            bowl(sequences, &self.0)
+        }
+        fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+            (self.returns(sequences), vec![1.0; sequences.values.len()])
+        }
+    }
+    let [_, (name, config)] = climbers();
+    let PlannerConfig::Hybrid(HybridConfig { icem, .. }) = &config else { unreachable!() };
+    let mut liar = Liar(target());
+    let honest = PlannerConfig::Icem(icem.clone()).build(2).plan(&mut liar, &mut |_| {}, &mut rng::stream(0, name));
+    let plan = config.build(2).plan(&mut liar, &mut |_| {}, &mut rng::stream(0, name));
+    assert!(plan.promised >= honest.promised, "{} after {}", plan.promised, honest.promised);
+}
+
+#[test]
+fn a_receding_horizon_plans_only_when_it_is_time() {
+    let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 50 });
+    let mut control = RecedingHorizon::new(&config, 2, 3);
+    let mut rng = rng::stream(0, "receding");
+    let mut plans = 0;
+    let target = target();
+    for step in 0..7 {
+        let mut objective = |c: &Sequences| {
+            plans += 1;
+            bowl(c, &target)
+        };
+        assert_eq!(control.act(&mut objective, &mut |_| {}, &mut rng).len(), 2);
+        assert_eq!(plans, step / 3 + 1);
+    }
+    control.reset();
+    control.act(&mut |c: &Sequences| bowl(c, &target), &mut |_| plans += 1, &mut rng);
+    assert_eq!(plans, 4, "a new episode begins with a new plan");
+}
 
 /// The planners that search, each with the distance (largest over all numbers) within which it must come to an
 /// optimum.
@@ -52,7 +115,7 @@ fn planners_find_the_bottom_of_a_bowl() {
             assert!(iteration.candidates.values.iter().all(|a| (-1.0..=1.0).contains(a)), "{name}: within bounds");
             iterations += 1;
         };
-        let plan = planner.plan(&mut |candidates| bowl(candidates, &target), &mut watch, &mut rng);
+        let plan = planner.plan(&mut |candidates: &Sequences| bowl(candidates, &target), &mut watch, &mut rng);
         assert!(iterations > 0);
         let distance = farthest(&plan, &target);
         assert!(distance < tolerance, "{name}: {distance} from the optimum");
@@ -65,7 +128,7 @@ fn shooting_takes_the_best_of_what_it_tried() {
     let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 300 });
     let mut tried = None;
     let mut watch = |i: &Iteration| tried = Some((i.candidates.clone(), i.returns.to_vec()));
-    let plan = config.build(2).plan(&mut |c| bowl(c, &target), &mut watch, &mut rng::stream(0, "shooting"));
+    let plan = config.build(2).plan(&mut |c: &Sequences| bowl(c, &target), &mut watch, &mut rng::stream(0, "shooting"));
     let (candidates, returns) = tried.expect("one iteration");
     assert_eq!(candidates.count(), 300);
     assert!(returns.iter().all(|r| *r <= plan.promised));
@@ -78,7 +141,7 @@ fn planners_reach_the_bounds() {
     for (name, config, _) in planners() {
         let mut planner = config.build(2);
         let sum = |candidates: &Sequences| candidates.rows().map(|row| row.iter().sum()).collect();
-        let plan = planner.plan(&mut |c| sum(c), &mut |_| {}, &mut rng::stream(1, name));
+        let plan = planner.plan(&mut |c: &Sequences| sum(c), &mut |_| {}, &mut rng::stream(1, name));
         let mean = plan.actions.iter().sum::<f32>() / plan.actions.len() as f32;
         // CEM's spread vanishes on the way to a bound, so it stops short of it.
         assert!(mean > 0.8, "{name}: {mean}");
@@ -108,13 +171,13 @@ fn a_warm_start_helps() {
         let mut rng = rng::stream(2, name);
         let mut distances = Vec::new();
         for _ in 0..6 {
-            let plan = planner.plan(&mut |c| bowl(c, &target), &mut |_| {}, &mut rng);
+            let plan = planner.plan(&mut |c: &Sequences| bowl(c, &target), &mut |_| {}, &mut rng);
             distances.push(plan.actions.iter().zip(&target).map(|(a, t)| (a - t).powi(2)).sum::<f32>());
             planner.shift(1);
         }
         assert!(distances[5] < 0.6 * distances[0], "{name}: {distances:?}");
         planner.reset();
-        let anew = planner.plan(&mut |c| bowl(c, &target), &mut |_| {}, &mut rng);
+        let anew = planner.plan(&mut |c: &Sequences| bowl(c, &target), &mut |_| {}, &mut rng);
         let distance = anew.actions.iter().zip(&target).map(|(a, t)| (a - t).powi(2)).sum::<f32>();
         assert!(distance > distances[5], "{name}: forgets when it is told to");
     }
@@ -129,7 +192,7 @@ fn not_a_number_is_never_chosen() {
         let half = |candidates: &Sequences| -> Vec<f32> {
             candidates.rows().map(|row| if row[0] > 0.0 { f32::NAN } else { row[1] }).collect()
         };
-        let plan = planner.plan(&mut |c| half(c), &mut |_| {}, &mut rng::stream(3, name));
+        let plan = planner.plan(&mut |c: &Sequences| half(c), &mut |_| {}, &mut rng::stream(3, name));
         assert!(plan.actions.iter().all(|a| a.is_finite()), "{name}");
         assert!(plan.actions[0] <= 0.0 && plan.promised.is_finite(), "{name}: {:?}", &plan.actions[..2]);
     }

@@ -2,16 +2,19 @@
 
 mod baselines;
 mod oracle;
+mod pets;
 mod sac;
 
 pub use baselines::{Random, Scripted};
 pub use oracle::{Oracle, OracleConfig};
+pub use pets::{Pets, PetsConfig};
 pub use sac::{Sac, SacConfig};
 
 use std::collections::BTreeMap;
 
 use crate::env::World;
 use crate::error::Result;
+use crate::model::open_loop::{OpenLoop, Trace};
 use crate::nn::Weights;
 use crate::replay::Transition;
 
@@ -40,6 +43,17 @@ pub struct Seat<'a> {
     pub world: &'a World,
 }
 
+/// A future that an agent imagined.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Foreseen {
+    /// What it expected to observe, from the present on.
+    pub observations: Vec<Vec<f32>>,
+    /// The return that it expected.
+    pub value: f32,
+    /// How far its models disagree about it.
+    pub disagreement: f32,
+}
+
 /// Something that acts and learns.
 pub trait Agent: Send {
     /// Chooses an action, each number in [-1, 1].
@@ -51,11 +65,22 @@ pub trait Agent: Send {
         seats.iter().map(|seat| self.act(seat.obs, Mode::Evaluate)).collect()
     }
 
+    /// Acts from one seat as [`Agent::act_all`] does, and shows some of the futures that were weighed up for it: nothing
+    /// for agents that do not plan in a model.
+    fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
+        (self.act_all(&[*seat]).remove(0), Vec::new())
+    }
+
     /// Takes in one step of experience.
     fn observe(&mut self, transition: &Transition);
 
     /// Learns from what was observed; called once after every step. `None` while it only collects.
     fn update(&mut self) -> Option<Losses>;
+
+    /// How well its model foresees episodes that it has not learned from; nothing for agents without a model.
+    fn judge_model(&self, _traces: &[Trace]) -> Vec<OpenLoop> {
+        Vec::new()
+    }
 
     /// What the agent has learned, enough to act.
     fn weights(&self) -> Weights;

@@ -13,8 +13,8 @@ use super::baselines::never_learns;
 use super::{Agent, Mode, Seat};
 use crate::env::tabletop::TableOptions;
 use crate::env::{Env, Snapshot, Task, World, WorldState};
-use crate::error::{Error, Result};
-use crate::plan::{IcemConfig, Planner, PlannerConfig, Sequences};
+use crate::error::Result;
+use crate::plan::{IcemConfig, PlannerConfig, RecedingHorizon, Sequences};
 use crate::rng::{self, Rng};
 
 /// Settings of [`Oracle`].
@@ -23,19 +23,21 @@ use crate::rng::{self, Rng};
 pub struct OracleConfig {
     /// The planner and its settings.
     pub planner: PlannerConfig,
+    /// Actions of a plan that are executed before the next plan is made.
+    pub replan_every: usize,
 }
 
 impl Default for OracleConfig {
     fn default() -> Self {
-        Self { planner: PlannerConfig::Icem(IcemConfig::default()) }
+        Self { planner: PlannerConfig::Icem(IcemConfig::default()), replan_every: 1 }
     }
 }
 
-/// A planner for each seat, and worlds to try things out in.
+/// A controller for each seat, and worlds to try things out in.
 pub struct Oracle {
     config: OracleConfig,
     actions: usize,
-    planners: BTreeMap<usize, Box<dyn Planner>>,
+    controllers: BTreeMap<usize, RecedingHorizon>,
     /// One for each thread.
     worlds: Vec<World>,
     rng: Rng,
@@ -47,25 +49,22 @@ impl Oracle {
     /// # Errors
     /// If a setting cannot be used.
     pub fn new(task: Task, options: TableOptions, config: OracleConfig, seed: u64) -> Result<Self> {
-        if config.planner.horizon() < 2 {
-            return Err(Error::BadSetting("oracle: a planner's horizon must be at least 2".into()));
-        }
+        config.planner.check()?;
         let worlds = (0..rayon::current_num_threads()).map(|_| task.make_with(options)).collect::<Result<Vec<_>>>()?;
         let actions = worlds[0].spec().action_size;
-        Ok(Self { config, actions, planners: BTreeMap::new(), worlds, rng: rng::stream(seed, "oracle") })
+        Ok(Self { config, actions, controllers: BTreeMap::new(), worlds, rng: rng::stream(seed, "oracle") })
     }
 
     fn plan(&mut self, seat: &Seat) -> Vec<f32> {
-        let Self { config, actions, planners, worlds, rng } = self;
-        let planner = planners.entry(seat.number).or_insert_with(|| config.planner.build(*actions));
+        let Self { config, actions, controllers, worlds, rng } = self;
+        let new = || RecedingHorizon::new(&config.planner, *actions, config.replan_every);
+        let controller = controllers.entry(seat.number).or_insert_with(new);
         if seat.first {
-            planner.reset();
+            controller.reset();
         }
         let state = seat.world.snapshot();
         let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates);
-        let plan = planner.plan(&mut objective, &mut |_| {}, rng);
-        planner.shift(1);
-        plan.actions[..*actions].to_vec()
+        controller.act(&mut objective, &mut |_| {}, rng)
     }
 }
 

@@ -17,7 +17,7 @@ use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::ops;
 use crate::nn::{
-    Adam, AdamConfig, Learning, Mlp, MlpConfig, SquashedGaussian, Tensor3, Weights, copy_parameters, device, polyak,
+    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, SquashedGaussian, Tensor3, Weights, copy_parameters, device, polyak,
     tensor, values,
 };
 use crate::replay::{Batch, ReplayBuffer, Transition};
@@ -120,6 +120,8 @@ impl Sac {
             hidden: config.hidden.clone(),
             output: 2 * actions,
             layer_norm: false,
+            activation: Activation::Relu,
+            init: Init::Uniform,
         };
         let critics = MlpConfig {
             members: config.critics,

@@ -132,6 +132,14 @@ impl Env for CartPole {
     }
 }
 
+impl CartPole {
+    /// Where the pole's tip would be drawn, m.
+    pub(super) fn tip(obs: &[f32]) -> [f64; 3] {
+        let (sin, cos) = f64::from(obs[2]).sin_cos();
+        [f64::from(obs[0]) + 2.0 * HALF_LENGTH * sin, 0.0, 0.5 + 2.0 * HALF_LENGTH * cos]
+    }
+}
+
 impl KnownReward for CartPole {
     fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
         f32::from(!self.terminated(next_obs))

@@ -45,12 +45,41 @@ pub struct Feature {
     pub centre: f32,
     /// A typical distance from `centre`: networks are fed (value - centre) / scale.
     pub scale: f32,
+    /// Its part in the course of events: models predict only what has a course of its own.
+    pub role: Role,
+}
+
+/// What part a number has in the course of events.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Role {
+    /// It has a course of its own.
+    #[default]
+    State,
+    /// It stays as it is through an episode: a goal.
+    Constant,
+    /// It is the difference of two others, which are named.
+    Difference {
+        /// From this
+        minuend: String,
+        /// this is subtracted.
+        subtrahend: String,
+    },
 }
 
 impl Feature {
     /// A feature around zero of size one.
     pub fn new(name: impl Into<String>) -> Self {
-        Self { name: name.into(), centre: 0.0, scale: 1.0 }
+        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::State }
+    }
+
+    /// The same feature, which stays as it is through an episode.
+    pub fn constant(self) -> Self {
+        Self { role: Role::Constant, ..self }
+    }
+
+    /// The same feature, which is the difference of two others.
+    pub fn difference(self, minuend: impl Into<String>, subtrahend: impl Into<String>) -> Self {
+        Self { role: Role::Difference { minuend: minuend.into(), subtrahend: subtrahend.into() }, ..self }
     }
 
     /// The same feature around another centre and of another size.

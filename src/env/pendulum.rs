@@ -124,6 +124,13 @@ impl Env for Pendulum {
     }
 }
 
+impl Pendulum {
+    /// Where the tip would be drawn, m.
+    pub(super) fn tip(obs: &[f32]) -> [f64; 3] {
+        [0.0, -f64::from(obs[1]), 1.2 + f64::from(obs[0])]
+    }
+}
+
 impl KnownReward for Pendulum {
     fn reward(&self, obs: &[f32], action: &[f32], _next_obs: &[f32]) -> f32 {
         let angle = f64::from(obs[1]).atan2(obs[0].into());

@@ -116,6 +116,18 @@ pub enum World {
     CartPole(CartPole),
 }
 
+impl World {
+    /// Where the point that the task is about would be drawn (m) in a state that is observed so: the hand, the tip of
+    /// the pendulum or of the pole. None if the observation does not tell.
+    pub fn place_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        match self {
+            World::Tabletop(world) => world.hand_of(obs),
+            World::Pendulum(_) => Some(Pendulum::tip(obs)),
+            World::CartPole(_) => Some(CartPole::tip(obs)),
+        }
+    }
+}
+
 /// A state of any of the worlds.
 #[derive(Clone)]
 pub enum WorldState {

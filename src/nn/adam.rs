@@ -1,11 +1,13 @@
-//! Adam (Kingma & Ba 2015), with gradient clipping by the global norm.
+//! Adam (Kingma & Ba 2015), with gradient clipping by the global norm and decoupled weight decay.
 
 use std::collections::BTreeMap;
 
 use dfdx::tensor::{Cpu, Gradients};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{Parameters, Weights, kernels, values};
+use super::kernels::vectorised_fn;
+use super::{Parameters, Weights, values};
 use crate::error::Result;
 
 /// Settings of [`Adam`].
@@ -19,12 +21,15 @@ pub struct AdamConfig {
     pub epsilon: f32,
     /// Gradients with a larger norm, over all parameters together, are scaled down to it.
     pub max_norm: Option<f32>,
+    /// Share of itself that a weight loses in a step of size one, whatever its gradient (AdamW, Loshchilov & Hutter
+    /// 2019). Biases and other parameters do not.
+    pub weight_decay: f32,
 }
 
 impl AdamConfig {
     /// The usual settings at this learning rate, without clipping.
     pub fn new(learning_rate: f32) -> Self {
-        Self { learning_rate, betas: [0.9, 0.999], epsilon: 1e-8, max_norm: None }
+        Self { learning_rate, betas: [0.9, 0.999], epsilon: 1e-8, max_norm: None, weight_decay: 0.0 }
     }
 }
 
@@ -46,42 +51,27 @@ impl Adam {
     /// One step against `gradients`. Returns their norm before clipping. A parameter on which nothing that was
     /// differentiated depends has a gradient of zero.
     pub fn step(&mut self, module: &mut impl Parameters, gradients: &mut Gradients<f32, Cpu>) -> f32 {
-        let squares = module.parameters().into_iter().map(|(_, parameter)| {
-            let gradient = gradients.get_or_alloc_mut(parameter).expect("memory for a gradient");
-            gradient.iter().map(|g| f64::from(*g) * f64::from(*g)).sum::<f64>()
+        // Every parameter with its gradient and its moments: a piece of work of its own.
+        let work = module.parameters_mut().into_iter().map(|(name, parameter)| {
+            let gradient = std::mem::take(&mut **gradients.get_or_alloc_mut(&*parameter).expect("memory for a gradient"));
+            let zeros = || [vec![0.0; gradient.len()], vec![0.0; gradient.len()]];
+            let moments = self.moments.remove(&name).unwrap_or_else(zeros);
+            (name, parameter, gradient, moments)
         });
-        let norm = squares.sum::<f64>().sqrt() as f32;
+        let mut work: Vec<_> = work.collect();
+        let squares: Vec<f64> = work.par_iter().map(|(_, _, gradient, _)| sum_of_squares(gradient)).collect();
+        let norm = squares.iter().sum::<f64>().sqrt() as f32;
         let clip = self.config.max_norm.map_or(1.0, |max| (max / norm.max(f32::MIN_POSITIVE)).min(1.0));
         self.steps += 1;
-        for (name, parameter) in module.parameters_mut() {
-            let gradient = gradients.get_or_alloc_mut(&*parameter).expect("memory for a gradient");
+        let rule = Rule::new(&self.config, self.steps, clip);
+        work.par_iter_mut().for_each(|(name, parameter, gradient, [first, second])| {
+            let decay = if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
             let mut updated = values(parameter).to_vec();
-            self.update(&name, &mut updated, gradient, clip);
+            update(&mut updated, gradient, first, second, Rule { decay, ..rule });
             parameter.copy_from(&updated);
-        }
-        norm
-    }
-
-    fn update(&mut self, name: &str, parameter: &mut [f32], gradient: &[f32], clip: f32) {
-        let AdamConfig { learning_rate, betas: [beta1, beta2], epsilon, .. } = self.config;
-        let zeros = || [vec![0.0; parameter.len()], vec![0.0; parameter.len()]];
-        if !self.moments.contains_key(name) {
-            self.moments.insert(name.into(), zeros());
-        }
-        let [first, second] = self.moments.get_mut(name).expect("just inserted");
-        // The bias corrections, folded into the step size and epsilon.
-        let correction1 = 1.0 - f64::from(beta1).powi(self.steps as i32);
-        let correction2 = (1.0 - f64::from(beta2).powi(self.steps as i32)).sqrt();
-        let rate = (f64::from(learning_rate) * correction2 / correction1) as f32;
-        let epsilon = (f64::from(epsilon) * correction2) as f32;
-        kernels::vectorised(|| {
-            for (((p, g), m), v) in parameter.iter_mut().zip(gradient).zip(first).zip(second) {
-                let g = clip * g;
-                *m += (1.0 - beta1) * (g - *m);
-                *v += (1.0 - beta2) * (g * g - *v);
-                *p -= rate * *m / (v.sqrt() + epsilon);
-            }
         });
+        self.moments = work.into_iter().map(|(name, _, _, moments)| (name, moments)).collect();
+        norm
     }
 
     /// Writes the optimiser's state into `weights`, under `prefix`.
@@ -111,4 +101,51 @@ impl Adam {
         }
         Ok(())
     }
+}
+
+/// What a step does to each number.
+#[derive(Clone, Copy)]
+struct Rule {
+    betas: [f32; 2],
+    /// The bias corrections are folded into step size and epsilon.
+    rate: f32,
+    epsilon: f32,
+    clip: f32,
+    decay: f32,
+}
+
+impl Rule {
+    fn new(config: &AdamConfig, steps: u32, clip: f32) -> Self {
+        let [first, second] = config.betas.map(|beta| 1.0 - f64::from(beta).powi(steps as i32));
+        let rate = (f64::from(config.learning_rate) * second.sqrt() / first) as f32;
+        let epsilon = (f64::from(config.epsilon) * second.sqrt()) as f32;
+        Self { betas: config.betas, rate, epsilon, clip, decay: 0.0 }
+    }
+}
+
+vectorised_fn! {
+    fn update(
+        parameter: &'a mut [f32],
+        gradient: &'a [f32],
+        first: &'a mut [f32],
+        second: &'a mut [f32],
+        rule: Rule,
+    ) {
+        let Rule { betas: [beta1, beta2], rate, epsilon, clip, decay } = rule;
+        for (((p, g), m), v) in parameter.iter_mut().zip(gradient).zip(first).zip(second) {
+            let g = clip * g;
+            *m += (1.0 - beta1) * (g - *m);
+            *v += (1.0 - beta2) * (g * g - *v);
+            *p -= decay * *p + rate * *m / (v.sqrt() + epsilon);
+        }
+    }
+}
+
+/// In eight sums side by side, which vectorise.
+fn sum_of_squares(values: &[f32]) -> f64 {
+    let mut sums = [0.0_f64; 8];
+    for chunk in values.chunks(8) {
+        chunk.iter().zip(&mut sums).for_each(|(x, sum)| *sum += f64::from(*x) * f64::from(*x));
+    }
+    sums.iter().sum()
 }

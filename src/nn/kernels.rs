@@ -5,14 +5,18 @@
 //! so results do not depend on the number of threads.
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 /// What follows a layer's affine part.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Activation {
     /// Nothing.
     Identity,
     /// max(0, x).
     Relu,
+    /// x sigmoid(x), also called swish: smooth, so that a model of a smooth world has smooth gradients.
+    Silu,
 }
 
 /// A row-major matrix, read as it stands or transposed.
@@ -78,9 +82,84 @@ pub fn matmul(out: &mut [f32], a: Matrix, b: Matrix, accumulate: bool) {
     }
 }
 
-/// Runs a loop compiled for the widest vectors that this processor has.
+/// Runs a loop compiled for the widest vectors that this processor has, if the compiler sees fit to inline it.
 pub fn vectorised<R>(work: impl FnOnce() -> R) -> R {
     pulp::Arch::new().dispatch(work)
+}
+
+/// Defines a function of slices whose loops are compiled for the widest vectors that this processor has. (Of a closure,
+/// which cannot be told to be inlined, the compiler makes a function for the oldest processors once it is long.)
+macro_rules! vectorised_fn {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $body:block) => {
+        $(#[$meta])*
+        $vis fn $name<'a>($($arg: $ty),*) {
+            struct Work<'a> {
+                $($arg: $ty,)*
+                borrows: std::marker::PhantomData<&'a ()>,
+            }
+            impl<'a> pulp::NullaryFnOnce for Work<'a> {
+                type Output = ();
+                #[inline(always)]
+                fn call(self) {
+                    let Work { $($arg,)* .. } = self;
+                    $body
+                }
+            }
+            pulp::Arch::new().dispatch(Work { $($arg,)* borrows: std::marker::PhantomData });
+        }
+    };
+}
+pub(crate) use vectorised_fn;
+
+/// 1 / (1 + exp(-x)).
+#[inline(always)]
+pub fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
+/// The exponential function to a relative 3e-7, written so that a loop over it vectorises, which a call of the standard
+/// library's does not. Beyond +-87 it stays at the values there.
+#[inline(always)]
+pub fn exp(x: f32) -> f32 {
+    // x = n ln 2 + r with a whole n and |r| <= ln 2 / 2; exp(r) by its series; 2^n through the exponent's bits.
+    const LN_2_HIGH: f32 = 0.693_359_4;
+    const LN_2_LOW: f32 = -2.121_944_4e-4;
+    // Adding 1.5 * 2^23 leaves the nearest whole number in a float's lowest bits.
+    const ROUND: f32 = 12_582_912.0;
+    let x = x.clamp(-87.0, 87.0);
+    let rounded = x.mul_add(std::f32::consts::LOG2_E, ROUND);
+    let n = rounded - ROUND;
+    let r = n.mul_add(-LN_2_LOW, n.mul_add(-LN_2_HIGH, x));
+    let mut series: f32 = 1.0 / 720.0;
+    for coefficient in [1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
+        series = series.mul_add(r, coefficient);
+    }
+    series * f32::from_bits((rounded.to_bits() << 23).wrapping_add(1.0_f32.to_bits()))
+}
+
+/// ln(1 + exp(x)), to 1e-7 of itself or of one.
+#[inline(always)]
+pub fn softplus(x: f32) -> f32 {
+    // ln(1 + u) = 2 artanh(u / (2 + u)) for u = exp(-|x|), by its series.
+    let u = exp(-x.abs());
+    let z = u / (2.0 + u);
+    let square = z * z;
+    let mut series: f32 = 1.0 / 13.0;
+    for coefficient in [1.0 / 11.0, 1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0] {
+        series = series.mul_add(square, coefficient);
+    }
+    x.max(0.0) + 2.0 * z * series
+}
+
+#[inline(always)]
+fn silu(x: f32) -> f32 {
+    x * sigmoid(x)
+}
+
+#[inline(always)]
+fn silu_slope(x: f32) -> f32 {
+    let s = sigmoid(x);
+    s * (1.0 + x * (1.0 - s))
 }
 
 /// The sizes of a dense layer over several networks at once.
@@ -101,7 +180,9 @@ pub struct DenseShape {
 impl DenseShape {
     /// Rows handed to one thread at a time, so that every core has work.
     fn rows_per_task(&self, rows: usize) -> usize {
-        let tasks = rayon::current_num_threads().div_ceil(self.members);
+        // Each network is one task if networks can be dealt out evenly; otherwise it is cut into so many that its parts can.
+        let threads = rayon::current_num_threads();
+        let tasks = (1..=threads).find(|tasks| (tasks * self.members).is_multiple_of(threads)).unwrap_or(1);
         // Below this much work a second core costs more than it brings.
         let enough = 2_000_000 / (self.input * self.output).max(1);
         rows.div_ceil(tasks).max(enough).min(rows).max(1)
@@ -131,31 +212,66 @@ pub fn dense(y: &mut [f32], x: &[f32], w: &[f32], b: &[f32], shape: DenseShape, 
             let first = task * rows;
             let count = y.len() / shape.output;
             matmul(y, x.rows(first, first + count), w, false);
-            vectorised(|| {
-                for row in y.chunks_exact_mut(shape.output) {
-                    for (y, b) in row.iter_mut().zip(b) {
-                        *y += b;
-                        if activation == Activation::Relu {
-                            *y = y.max(0.0);
-                        }
-                    }
-                }
-            });
+            add_and_activate(y, b, activation);
         });
     });
 }
 
-/// From the gradient of y to the gradient of `x w + b`, in place.
-pub fn through_activation(dy: &mut [f32], y: &[f32], activation: Activation) {
-    if activation == Activation::Relu {
+vectorised_fn! {
+    /// `y = activation(y + b)` for rows of y, with b the same in each.
+    pub fn add_and_activate(y: &'a mut [f32], b: &'a [f32], activation: Activation) {
+        match activation {
+            Activation::Identity => for_rows(y, b, |x| x),
+            Activation::Relu => for_rows(y, b, |x| x.max(0.0)),
+            Activation::Silu => for_rows(y, b, silu),
+        }
+    }
+}
+
+#[inline(always)]
+fn for_rows(y: &mut [f32], b: &[f32], f: impl Fn(f32) -> f32) {
+    for row in y.chunks_exact_mut(b.len()) {
+        for (y, b) in row.iter_mut().zip(b) {
+            *y = f(*y + b);
+        }
+    }
+}
+
+/// `y = activation(y)`.
+pub fn activate(y: &mut [f32], activation: Activation) {
+    if activation != Activation::Identity {
+        let chunk = y.len().div_ceil(rayon::current_num_threads()).max(16_384);
+        y.par_chunks_mut(chunk).for_each(|y| activate_all(y, activation));
+    }
+}
+
+vectorised_fn! {
+    fn activate_all(y: &'a mut [f32], activation: Activation) {
+        match activation {
+            Activation::Identity => {}
+            Activation::Relu => y.iter_mut().for_each(|y| *y = y.max(0.0)),
+            Activation::Silu => y.iter_mut().for_each(|y| *y = silu(*y)),
+        }
+    }
+}
+
+/// From the gradient of `activation(z)` to the gradient of z, in place. Where only the sign of z matters (ReLU),
+/// `z` may be its activation.
+pub fn through_activation(dy: &mut [f32], z: &[f32], activation: Activation) {
+    if activation != Activation::Identity {
         let chunk = dy.len().div_ceil(rayon::current_num_threads()).max(16_384);
-        dy.par_chunks_mut(chunk).zip(y.par_chunks(chunk)).for_each(|(dy, y)| {
-            vectorised(|| {
-                for (dy, y) in dy.iter_mut().zip(y) {
-                    *dy = if *y > 0.0 { *dy } else { 0.0 };
-                }
-            });
-        });
+        dy.par_chunks_mut(chunk).zip(z.par_chunks(chunk)).for_each(|(dy, z)| multiply_by_slope(dy, z, activation));
+    }
+}
+
+vectorised_fn! {
+    fn multiply_by_slope(dy: &'a mut [f32], z: &'a [f32], activation: Activation) {
+        let pairs = dy.iter_mut().zip(z);
+        match activation {
+            Activation::Identity => {}
+            Activation::Relu => pairs.for_each(|(dy, z)| *dy = if *z > 0.0 { *dy } else { 0.0 }),
+            Activation::Silu => pairs.for_each(|(dy, z)| *dy *= silu_slope(*z)),
+        }
     }
 }
 
@@ -201,4 +317,26 @@ pub fn dense_parameter_gradients(dw: &mut [f32], db: &mut [f32], x: &[f32], dz: 
             }
         });
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_fast_exponential_is_exact_enough() {
+        for i in -8700..=8700 {
+            let x = i as f32 / 100.0;
+            let truth = f64::from(x).exp();
+            let error = (f64::from(exp(x)) - truth).abs() / truth;
+            assert!(error < 3e-7, "exp({x}) is off by {error:e}");
+        }
+        for i in -200..=200 {
+            let x = i as f32 / 10.0;
+            let truth = f64::from(x).exp().ln_1p();
+            assert!((f64::from(softplus(x)) - truth).abs() < 2e-7 * truth.max(1.0), "softplus({x})");
+        }
+        assert!(exp(-1e9) > 0.0 && exp(1e9).is_finite());
+        assert!((sigmoid(0.0) - 0.5).abs() < 1e-7 && sigmoid(-100.0) < 1e-30 && sigmoid(100.0) == 1.0);
+    }
 }

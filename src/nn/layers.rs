@@ -47,12 +47,27 @@ pub struct MlpConfig {
     pub output: usize,
     /// Whether hidden layers are normalised before their activation.
     pub layer_norm: bool,
+    /// What follows each hidden layer.
+    pub activation: Activation,
+    /// How parameters are drawn.
+    pub init: Init,
 }
 
-/// ReLU networks: affine, optional layer normalisation, ReLU; the last layer is affine.
+/// How the parameters of a layer of n inputs are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Init {
+    /// Weights and biases uniform in +-1/sqrt(n), as in PyTorch.
+    Uniform,
+    /// Weights normal with deviation 1 / (2 sqrt(n)), cut off at two deviations; biases zero: as in PETS.
+    TruncatedNormal,
+}
+
+/// Fully connected networks: affine, optional layer normalisation, activation; the last layer is affine.
 #[derive(Clone, Debug)]
 pub struct Mlp {
     layers: Vec<Layer>,
+    activation: Activation,
 }
 
 #[derive(Clone, Debug)]
@@ -64,7 +79,7 @@ struct Layer {
 }
 
 impl Mlp {
-    /// New networks. Weights and biases are uniform in +-1/sqrt(inputs), as in PyTorch.
+    /// New networks.
     pub fn new(cpu: &Cpu, config: &MlpConfig, rng: &mut Rng) -> Self {
         let sizes: Vec<usize> = [config.input].iter().chain(&config.hidden).chain([&config.output]).copied().collect();
         let members = config.members;
@@ -73,8 +88,12 @@ impl Mlp {
             let (input, output) = (size[0], size[1]);
             let bound = 1.0 / (input as f64).sqrt();
             let mut draw = |rows: usize| {
-                let count = members * rows * output;
-                let numbers = (0..count).map(|_| rng::uniform(rng, -bound, bound) as f32).collect();
+                let number = |_| match config.init {
+                    Init::Uniform => rng::uniform(rng, -bound, bound),
+                    Init::TruncatedNormal if rows == 1 => 0.0,
+                    Init::TruncatedNormal => 0.5 * bound * rng::truncated_normal(rng),
+                };
+                let numbers = (0..members * rows * output).map(number).map(|x| x as f32).collect();
                 super::tensor(cpu, numbers, (members, rows, output))
             };
             let (weight, bias) = (draw(input), draw(1));
@@ -85,19 +104,46 @@ impl Mlp {
             });
             layers.push(Layer { weight, bias, norm });
         }
-        Self { layers }
+        Self { layers, activation: config.activation }
+    }
+
+    /// Networks of the given layers, each a weight `[input, output]` and a bias `[output]`, for each member.
+    ///
+    /// # Panics
+    /// If the members' layers are not of the same sizes.
+    pub fn from_layers(cpu: &Cpu, members: &[Vec<(&[f32], &[f32])>], activation: Activation) -> Self {
+        let layer = |i: usize| {
+            let weights: Vec<f32> = members.iter().flat_map(|layers| layers[i].0).copied().collect();
+            let biases: Vec<f32> = members.iter().flat_map(|layers| layers[i].1).copied().collect();
+            let output = biases.len() / members.len();
+            let input = weights.len() / biases.len();
+            let weight = super::tensor(cpu, weights, (members.len(), input, output));
+            Layer { weight, bias: super::tensor(cpu, biases, (members.len(), 1, output)), norm: None }
+        };
+        Self { layers: (0..members[0].len()).map(layer).collect(), activation }
+    }
+
+    /// Weight `[input, output]` and bias `[output]` of each layer of one network, without tape: what planners run on.
+    /// Layer normalisation is not among them.
+    pub fn layers_of(&self, member: usize) -> impl Iterator<Item = (&[f32], &[f32])> {
+        let of_member = move |parameter| {
+            let numbers = values(parameter);
+            let size = numbers.len() / parameter.shape().0;
+            &numbers[member * size..][..size]
+        };
+        self.layers.iter().map(move |layer| (of_member(&layer.weight), of_member(&layer.bias)))
     }
 
     /// The outputs for `x` (`[members or 1, batch, input]`).
     pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Learning) -> Tensor3<T> {
         let last = self.layers.len() - 1;
         self.layers.iter().enumerate().fold(x, |x, (i, Layer { weight, bias, norm })| {
-            let relu = if i < last { Activation::Relu } else { Activation::Identity };
+            let activation = if i < last { self.activation } else { Activation::Identity };
             match norm {
-                None => ops::dense(x, weight, bias, relu, learning),
+                None => ops::dense(x, weight, bias, activation, learning),
                 Some((gain, shift)) => {
                     let x = ops::dense(x, weight, bias, Activation::Identity, learning);
-                    ops::layer_norm(x, gain, shift, relu, learning)
+                    ops::layer_norm(x, gain, shift, activation, learning)
                 }
             }
         })

@@ -9,6 +9,7 @@ mod adam;
 mod gaussian;
 pub mod kernels;
 mod layers;
+mod likelihood;
 pub mod ops;
 mod weights;
 
@@ -16,7 +17,8 @@ pub use adam::{Adam, AdamConfig};
 pub use dfdx;
 pub use gaussian::SquashedGaussian;
 pub use kernels::Activation;
-pub use layers::{Mlp, MlpConfig, Parameters, copy_parameters, polyak};
+pub use layers::{Init, Mlp, MlpConfig, Parameters, copy_parameters, polyak};
+pub use likelihood::{LogVarianceBounds, bounded, bounded_nll};
 pub use ops::{Learning, Tensor2, Tensor3, values};
 pub use weights::Weights;
 

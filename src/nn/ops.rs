@@ -36,7 +36,7 @@ pub fn values<T>(tensor: &Tensor3<T>) -> &[f32] {
 }
 
 /// Takes the gradient of an operation's result out of the store; nothing else will need it.
-fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<Vec<f32>, CpuError> {
+pub(crate) fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<Vec<f32>, CpuError> {
     Ok(std::mem::take(gradients.get_or_alloc_mut(of)?))
 }
 
@@ -47,6 +47,13 @@ pub enum Learning {
     Trained,
     /// Gradients flow through to the input only.
     Frozen,
+}
+
+/// Activates `y`; returns what it was before. The gradient of a ReLU can be told from its result, that of a SiLU cannot.
+fn before_activation(y: &mut [f32], activation: Activation) -> Vec<f32> {
+    let before = y.to_vec();
+    kernels::activate(y, activation);
+    before
 }
 
 /// `activation(x w + b)`: x `[members or 1, batch, input]`, w `[members, input, output]`,
@@ -67,14 +74,17 @@ pub fn dense<T: Tape<f32, Cpu>>(
     let shape = DenseShape { members, batch, input, output, shared_input: x_members == 1 };
 
     let mut y = vec![0.0; members * batch * output];
-    kernels::dense(&mut y, values(&x), values(w), values(b), shape, activation);
+    let keeps = T::OWNS_TAPE && activation == Activation::Silu;
+    let fused = if keeps { Activation::Identity } else { activation };
+    kernels::dense(&mut y, values(&x), values(w), values(b), shape, fused);
+    let before = keeps.then(|| before_activation(&mut y, activation));
     let y = x.device().tensor_from_vec(y, (members, batch, output));
 
     if T::OWNS_TAPE {
         let (w, b, y) = (w.clone(), b.clone(), y.clone());
         tape.add_backward_op(move |gradients| {
             let mut dz = take(gradients, &y)?;
-            kernels::through_activation(&mut dz, values(&y), activation);
+            kernels::through_activation(&mut dz, before.as_deref().unwrap_or(values(&y)), activation);
             if learning == Learning::Trained {
                 let mut db = take(gradients, &b)?;
                 let dw = gradients.get_or_alloc_mut(&w)?;
@@ -121,19 +131,17 @@ pub fn layer_norm<T: Tape<f32, Cpu>>(
             for (((x, y), gain), shift) in normal.iter_mut().zip(y).zip(gain).zip(shift) {
                 *x = (*x - mean) * scale;
                 *y = gain * *x + shift;
-                if activation == Activation::Relu {
-                    *y = y.max(0.0);
-                }
             }
         });
     }
+    let before = before_activation(&mut y, activation);
     let y = x.device().tensor_from_vec(y, (members, batch, features));
 
     if T::OWNS_TAPE {
         let (gain, shift, y) = (gain.clone(), shift.clone(), y.clone());
         tape.add_backward_op(move |gradients| {
             let mut dz = take(gradients, &y)?;
-            kernels::through_activation(&mut dz, values(&y), activation);
+            kernels::through_activation(&mut dz, &before, activation);
             if learning == Learning::Trained {
                 let mut d_gain = take(gradients, &gain)?;
                 let d_shift = gradients.get_or_alloc_mut(&shift)?;

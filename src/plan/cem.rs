@@ -54,7 +54,7 @@ impl Planner for Cem {
         self.mean.fill(0.0);
     }
 
-    fn plan(&mut self, objective: &mut Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
         let CemConfig { horizon, population, elites, iterations, momentum } = self.config;
         let mut variance = vec![START_VARIANCE; self.mean.len()];
         let mut promised = f32::NEG_INFINITY;
@@ -68,10 +68,10 @@ impl Planner for Cem {
                 let row = self.mean.iter().zip(&variance);
                 candidates
                     .values
-                    .extend(row.map(|(m, v)| (m + constrained(*v, *m).sqrt() * truncated_normal(rng)) as f32));
+                    .extend(row.map(|(m, v)| (m + constrained(*v, *m).sqrt() * rng::truncated_normal(rng)) as f32));
             }
             // Score.
-            let returns = objective(&candidates);
+            let returns = objective.returns(&candidates);
             // Refit.
             let order = best(&returns, elites);
             promised = promised.max(returns[order[0]]);
@@ -92,16 +92,6 @@ fn constrained(variance: f64, mean: f64) -> f64 {
     variance.min(((mean + 1.0) / 2.0).powi(2)).min(((1.0 - mean) / 2.0).powi(2))
 }
 
-/// A standard normal number, drawn again until it lies within two standard deviations.
-fn truncated_normal(rng: &mut Rng) -> f64 {
-    loop {
-        let z = rng::normal(rng);
-        if z.abs() <= 2.0 {
-            return z;
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -117,7 +107,7 @@ mod tests {
     fn truncated_numbers_have_the_right_spread() {
         let mut rng = rng::stream(0, "truncated");
         let n = 200_000;
-        let squares: f64 = (0..n).map(|_| truncated_normal(&mut rng).powi(2)).sum();
+        let squares: f64 = (0..n).map(|_| rng::truncated_normal(&mut rng).powi(2)).sum();
         let deviation = (squares / f64::from(n)).sqrt();
         assert!((deviation - 0.879_625_66).abs() < 3e-3, "{deviation}");
     }

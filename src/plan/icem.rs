@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::noise::ColoredNoise;
-use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, best, refit, shifted};
+use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, as_actions, best, refit, shifted};
 use crate::rng::Rng;
 
 /// Settings of [`Icem`].
@@ -32,6 +32,9 @@ pub struct IcemConfig {
     pub start_deviation: f64,
     /// Share of the elites that is kept.
     pub kept: f64,
+    /// Executes the mean of the last distribution rather than the best sequence that was seen, which a model may
+    /// have flattered.
+    pub execute_mean: bool,
 }
 
 impl Default for IcemConfig {
@@ -46,6 +49,7 @@ impl Default for IcemConfig {
             colour: 2.5,
             start_deviation: 0.5,
             kept: 0.3,
+            execute_mean: false,
         }
     }
 }
@@ -73,6 +77,12 @@ impl Icem {
         std::iter::successors(Some(config.population), next).take(config.iterations).collect()
     }
 
+    /// Takes a better plan for the best of its elites.
+    pub(super) fn adopt(&mut self, actions: &[f32]) {
+        self.elites.insert(0, actions.to_vec());
+        self.elites.truncate(self.config.elites);
+    }
+
     fn sample(&self, variance: &[f64], rng: &mut Rng) -> Vec<f32> {
         let columns: Vec<Vec<f64>> = (0..self.actions).map(|_| self.noise.sample(rng)).collect();
         let numbers = self.mean.iter().zip(variance).enumerate();
@@ -87,7 +97,7 @@ impl Planner for Icem {
         self.elites.clear();
     }
 
-    fn plan(&mut self, objective: &mut Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
         let config = self.config.clone();
         let kept = (config.kept * config.elites as f64).ceil() as usize;
         let mut variance = vec![config.start_deviation.powi(2); self.mean.len()];
@@ -104,13 +114,16 @@ impl Planner for Icem {
                 candidates.values.extend(self.mean.iter().map(|a| *a as f32));
             }
             // Score.
-            let returns = objective(&candidates);
+            let returns = objective.returns(&candidates);
             // Refit.
             let order = best(&returns, config.elites);
             self.elites = order.iter().map(|&i| candidates.row(i).to_vec()).collect();
             let elites: Vec<&[f32]> = self.elites.iter().map(Vec::as_slice).collect();
             refit(&mut self.mean, &mut variance, &elites, config.momentum);
             plan = Plan { actions: self.elites[0].clone(), promised: returns[order[0]] };
+            if config.execute_mean {
+                plan.actions = as_actions(&self.mean);
+            }
             observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &self.mean });
         }
         plan

@@ -2,23 +2,30 @@
 //!
 //! A planner knows nothing of environments or models. It proposes sequences, is told what each is
 //! worth, and keeps what is worth keeping for the next time, when the world has moved on a step
-//! ([`Planner::shift`]): receding-horizon control. An observer may watch every iteration.
+//! ([`Planner::shift`]). [`RecedingHorizon`] makes a controller of it. An observer may watch every iteration.
 //!
 //! Actions lie in [-1, 1].
 
 mod cem;
+mod control;
+mod gradient;
+mod hybrid;
 mod icem;
 mod mppi;
 pub mod noise;
 mod shooting;
 
 pub use cem::{Cem, CemConfig};
+pub use control::RecedingHorizon;
+pub use gradient::{Gradient, GradientConfig};
+pub use hybrid::{Hybrid, HybridConfig};
 pub use icem::{Icem, IcemConfig};
 pub use mppi::{Mppi, MppiConfig};
 pub use shooting::{RandomShooting, ShootingConfig};
 
 use serde::{Deserialize, Serialize};
 
+use crate::error::{Error, Result};
 use crate::rng::Rng;
 
 /// A batch of action sequences, `[count, horizon, actions]`.
@@ -58,8 +65,35 @@ impl Sequences {
     }
 }
 
-/// What sequences are worth: one return for each. Not a number counts as worst.
-pub type Objective<'a> = dyn FnMut(&Sequences) -> Vec<f32> + 'a;
+/// What a planner maximises. Any closure from sequences to returns is an objective.
+pub trait Objective {
+    /// What sequences are worth: one return for each. Not a number counts as worst.
+    fn returns(&mut self, sequences: &Sequences) -> Vec<f32>;
+
+    /// Returns, and how they change with every number of every sequence (`[count, horizon, actions]`). Unless an
+    /// objective knows better, central differences: two more returns for each number.
+    fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+        const STEP: f32 = 1e-3;
+        let width = sequences.width();
+        let mut around = Sequences::new(sequences.horizon, sequences.actions);
+        for row in sequences.rows() {
+            for (i, step) in (0..width).flat_map(|i| [(i, STEP), (i, -STEP)]) {
+                around.values.extend(row);
+                let start = around.values.len() - width;
+                around.values[start + i] += step;
+            }
+        }
+        let differences = self.returns(&around);
+        let slopes = differences.chunks(2).map(|pair| (pair[0] - pair[1]) / (2.0 * STEP)).collect();
+        (self.returns(sequences), slopes)
+    }
+}
+
+impl<F: FnMut(&Sequences) -> Vec<f32>> Objective for F {
+    fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+        self(sequences)
+    }
+}
 
 /// One iteration of a planner, for those who watch.
 pub struct Iteration<'a> {
@@ -92,7 +126,7 @@ pub trait Planner: Send {
     fn reset(&mut self);
 
     /// Searches for the best sequence.
-    fn plan(&mut self, objective: &mut Objective, observer: &mut Observer, rng: &mut Rng) -> Plan;
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan;
 
     /// The first `steps` actions of the plan were executed: the memory moves on with the world.
     fn shift(&mut self, steps: usize);
@@ -110,6 +144,10 @@ pub enum PlannerConfig {
     Icem(IcemConfig),
     /// Model-predictive path integrals.
     Mppi(MppiConfig),
+    /// Gradient ascent from several starts.
+    Gradient(GradientConfig),
+    /// iCEM, then gradient ascent from what it found.
+    Hybrid(HybridConfig),
 }
 
 impl PlannerConfig {
@@ -120,6 +158,8 @@ impl PlannerConfig {
             PlannerConfig::Cem(config) => Box::new(Cem::new(config.clone(), actions)),
             PlannerConfig::Icem(config) => Box::new(Icem::new(config.clone(), actions)),
             PlannerConfig::Mppi(config) => Box::new(Mppi::new(config.clone(), actions)),
+            PlannerConfig::Gradient(config) => Box::new(Gradient::new(config.clone(), actions)),
+            PlannerConfig::Hybrid(config) => Box::new(Hybrid::new(config.clone(), actions)),
         }
     }
 
@@ -130,7 +170,29 @@ impl PlannerConfig {
             PlannerConfig::Cem(config) => config.horizon,
             PlannerConfig::Icem(config) => config.horizon,
             PlannerConfig::Mppi(config) => config.horizon,
+            PlannerConfig::Gradient(config) => config.horizon,
+            PlannerConfig::Hybrid(config) => config.icem.horizon,
         }
+    }
+
+    /// # Errors
+    /// If the horizon is shorter than two steps, or nothing would be tried.
+    pub(crate) fn check(&self) -> Result<()> {
+        let tried = match self {
+            PlannerConfig::Shooting(config) => config.population,
+            PlannerConfig::Cem(config) => config.population.min(config.elites).min(config.iterations),
+            PlannerConfig::Icem(config) => config.population.min(config.elites).min(config.iterations),
+            PlannerConfig::Mppi(config) => config.population.min(config.iterations),
+            PlannerConfig::Gradient(config) => config.starts,
+            PlannerConfig::Hybrid(HybridConfig { icem, .. }) => icem.population.min(icem.elites).min(icem.iterations),
+        };
+        if self.horizon() < 2 {
+            return Err(Error::BadSetting("planner: `horizon` must be at least 2".into()));
+        }
+        if tried == 0 {
+            return Err(Error::BadSetting("planner: population, elites, iterations, starts: at least 1 of each".into()));
+        }
+        Ok(())
     }
 }
 

@@ -66,14 +66,14 @@ impl Planner for Mppi {
         self.before.fill(0.0);
     }
 
-    fn plan(&mut self, objective: &mut Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
         let mut promised = f32::NEG_INFINITY;
         for index in 0..self.config.iterations {
             let mut candidates = Sequences::new(self.config.horizon, self.actions);
             for _ in 0..self.config.population {
                 candidates.values.extend(self.sample(rng));
             }
-            let returns = objective(&candidates);
+            let returns = objective.returns(&candidates);
             promised = returns.iter().copied().fold(promised, f32::max);
             let weights = weights(&returns, self.config.temperature * spread(&returns));
             self.mean.fill(0.0);

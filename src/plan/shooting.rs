@@ -37,11 +37,11 @@ impl RandomShooting {
 impl Planner for RandomShooting {
     fn reset(&mut self) {}
 
-    fn plan(&mut self, objective: &mut Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
         let mut candidates = Sequences::new(self.config.horizon, self.actions);
         let count = self.config.population * candidates.width();
         candidates.values = (0..count).map(|_| rng::uniform(rng, -1.0, 1.0) as f32).collect();
-        let returns = objective(&candidates);
+        let returns = objective.returns(&candidates);
         let winner = best(&returns, 1)[0];
         let actions = candidates.row(winner).to_vec();
         let mean: Vec<f64> = actions.iter().map(|a| f64::from(*a)).collect();

@@ -1,21 +1,23 @@
 //! What a run is: task, method, seed, budget, settings; from presets, files and the command line.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::agent::{Agent, Oracle, OracleConfig, Random, Sac, SacConfig, Scripted};
+use crate::agent::{Agent, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted};
 use crate::env::tabletop::TableOptions;
 use crate::env::{Env, Task, World};
 use crate::error::{Error, Result};
 
 /// The presets that come with the crate: the methods that the command line knows. A preset's table
 /// `for.TASK` holds what differs for that task.
-const PRESETS: [(&str, &str); 5] = [
+const PRESETS: [(&str, &str); 6] = [
     ("random", include_str!("../../data/presets/random.toml")),
     ("scripted", include_str!("../../data/presets/scripted.toml")),
     ("oracle", include_str!("../../data/presets/oracle.toml")),
+    ("pets", include_str!("../../data/presets/pets.toml")),
     ("sac", include_str!("../../data/presets/sac.toml")),
     ("debug", include_str!("../../data/presets/debug.toml")),
 ];
@@ -35,6 +37,8 @@ pub enum AgentKind {
     Scripted,
     /// [`Oracle`].
     Oracle,
+    /// [`Pets`].
+    Pets,
     /// [`Sac`].
     Sac,
 }
@@ -68,6 +72,9 @@ pub struct RunConfig {
     /// Settings of the oracle, for agents of that kind.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub oracle: Option<OracleConfig>,
+    /// Settings of PETS, for agents of that kind.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pets: Option<PetsConfig>,
     /// Settings of SAC, for agents of that kind.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sac: Option<SacConfig>,
@@ -145,7 +152,7 @@ impl RunConfig {
 
     /// Whether the method learns; the others are only tested.
     pub fn learns(&self) -> bool {
-        self.steps > 0 && self.agent == AgentKind::Sac
+        self.steps > 0 && matches!(self.agent, AgentKind::Pets | AgentKind::Sac)
     }
 
     /// The run's world.
@@ -167,6 +174,10 @@ impl RunConfig {
             AgentKind::Scripted => Box::new(Scripted::new(self.task, self.env)?),
             AgentKind::Oracle => {
                 Box::new(Oracle::new(self.task, self.env, self.oracle.clone().unwrap_or_default(), self.seed)?)
+            }
+            AgentKind::Pets => {
+                let spec = world.spec().clone();
+                Box::new(Pets::new(&spec, Arc::new(world), self.pets.clone().unwrap_or_default(), self.seed)?)
             }
             AgentKind::Sac => Box::new(Sac::new(world.spec(), self.sac.clone().unwrap_or_default(), self.seed)?),
         })

@@ -10,6 +10,7 @@ use crate::agent::{Agent, Seat};
 use crate::env::vector::VectorEnv;
 use crate::env::{Env, World};
 use crate::error::{Error, Result};
+use crate::model::open_loop::Trace;
 
 /// Worlds that are stepped side by side; agents answer for all of them in one pass.
 const WORLDS: usize = 20;
@@ -61,6 +62,8 @@ pub struct Evaluation {
     pub episodes: Vec<Episode>,
     /// Time to choose one action, ms, when asked for one at a time.
     pub action_ms: f64,
+    /// The episodes themselves, for those who judge models by them.
+    pub traces: Vec<Trace>,
 }
 
 /// The numbers of an [`Evaluation`], as they stand in tables.
@@ -131,15 +134,22 @@ impl Judge {
             return Err(Error::BadSetting("an evaluation needs at least one episode".into()));
         }
         let mut judged = Vec::with_capacity(episodes);
+        let mut traces = Vec::with_capacity(episodes);
         let mut action_ms = 0.0;
         for first in (0..episodes).step_by(WORLDS) {
             let seeds: Vec<u64> = (first..episodes.min(first + WORLDS)).map(|i| starts.seed(i)).collect();
-            judged.extend(self.side_by_side(agent, &seeds, &mut action_ms)?);
+            judged.extend(self.side_by_side(agent, &seeds, &mut action_ms, &mut traces)?);
         }
-        Ok(Evaluation { episodes: judged, action_ms })
+        Ok(Evaluation { episodes: judged, action_ms, traces })
     }
 
-    fn side_by_side(&mut self, agent: &mut dyn Agent, seeds: &[u64], action_ms: &mut f64) -> Result<Vec<Episode>> {
+    fn side_by_side(
+        &mut self,
+        agent: &mut dyn Agent,
+        seeds: &[u64],
+        action_ms: &mut f64,
+        traces: &mut Vec<Trace>,
+    ) -> Result<Vec<Episode>> {
         let dt = self.worlds.envs()[0].spec().dt;
         let mut observations = self.worlds.reset(seeds);
         let mut paths: Vec<Vec<[f64; 3]>> =
@@ -147,6 +157,8 @@ impl Judge {
         let blank = Episode { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
         let mut episodes = vec![blank; seeds.len()];
         let mut running: Vec<usize> = (0..seeds.len()).collect();
+        let starts = observations.iter().map(|obs| Trace { observations: vec![obs.clone()], actions: Vec::new() });
+        let mut traced: Vec<Trace> = starts.collect();
         let seat = Seat { number: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
         *action_ms = time_of_action(agent, seat);
         let mut first = true;
@@ -167,12 +179,15 @@ impl Judge {
                 episode.length += 1;
                 episode.stage = episode.stage.max(step.stage);
                 paths[i].extend(self.worlds.envs()[i].hand());
+                traced[i].observations.push(step.observation.clone());
+                traced[i].actions.extend(actions[i].clone());
                 if step.done() {
                     running.retain(|&other| other != i);
                 }
                 observations[i] = step.observation;
             }
         }
+        traces.extend(traced);
         for (episode, path) in episodes.iter_mut().zip(&paths) {
             if let Some((sparc, ldlj)) = smoothness::of_path(path, dt) {
                 (episode.sparc, episode.ldlj) = (Some(sparc), Some(ldlj));

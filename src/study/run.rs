@@ -17,6 +17,7 @@ use crate::agent::{Agent, Mode};
 use crate::env::{Env, World};
 use crate::error::{Error, Result};
 use crate::files;
+use crate::model::open_loop::OpenLoop;
 use crate::nn::Weights;
 use crate::replay::Transition;
 
@@ -84,6 +85,23 @@ pub struct LossRow {
     pub value: f32,
 }
 
+/// A row of `model.csv`: how well the model foresees the last evaluation's episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// See [`OpenLoop`].
+    pub horizon: usize,
+    /// See [`OpenLoop`].
+    pub rmse: f64,
+    /// See [`OpenLoop`].
+    pub nll: f64,
+    /// See [`OpenLoop`].
+    pub coverage90: f64,
+    /// See [`OpenLoop`].
+    pub rmse_p90: f64,
+}
+
 /// What a run has seen so far; the CSV files are this.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct Progress {
@@ -92,6 +110,8 @@ struct Progress {
     episodes: Vec<EpisodeRow>,
     evaluations: Vec<EvaluationRow>,
     losses: Vec<LossRow>,
+    #[serde(default)]
+    model: Vec<ModelRow>,
     /// Sum and count of each loss since the last row of it.
     pending: BTreeMap<String, (f32, usize)>,
 }
@@ -212,9 +232,8 @@ impl Run {
         self.progress.step += 1;
         self.episode_return += f64::from(outcome.reward);
         self.episode_length += 1;
-        if let Some(losses) = self.agent.update() {
-            self.note(losses);
-        }
+        let losses = self.agent.update().unwrap_or_default();
+        self.note(losses);
         if !outcome.done() {
             return Ok(Event::Stepped);
         }
@@ -261,6 +280,16 @@ impl Run {
         let episodes = self.config.evaluation_episodes;
         let evaluation = self.judge.evaluate(self.agent.as_mut(), episodes, Starts::Training)?;
         let row = EvaluationRow::new(self.progress.step, evaluation.summary());
+        let model = self.agent.judge_model(&evaluation.traces).into_iter();
+        let step = self.progress.step;
+        self.progress.model.extend(model.map(|OpenLoop { horizon, rmse, nll, coverage90, rmse_p90 }| ModelRow {
+            step,
+            horizon,
+            rmse,
+            nll,
+            coverage90,
+            rmse_p90,
+        }));
         self.evaluated_at = Some(self.progress.step);
         self.progress.evaluations.push(row.clone());
         Ok(Event::Evaluated(row))
@@ -295,7 +324,10 @@ impl Run {
             state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
             weights.write(&self.folder.join("weights.safetensors"))?;
         }
-        let Progress { episodes, evaluations, losses, .. } = &self.progress;
+        let Progress { episodes, evaluations, losses, model, .. } = &self.progress;
+        if !model.is_empty() {
+            write_csv(&self.folder.join("model.csv"), &MODEL_COLUMNS, model.iter())?;
+        }
         write_csv(&self.folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
         write_csv(&self.folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations.iter())?;
         write_csv(&self.folder.join("losses.csv"), &["step", "name", "value"], losses.iter())
@@ -305,6 +337,7 @@ impl Run {
 const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "length", "seconds"];
 const EVALUATION_COLUMNS: [&str; 8] =
     ["step", "episodes", "success", "return_mean", "return_std", "smoothness_sparc", "smoothness_ldlj", "action_ms"];
+const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90", "rmse_p90"];
 const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
 
 /// Whether the run in `folder` is complete.

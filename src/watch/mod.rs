@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::agent::{Agent, Seat};
+use crate::agent::{Agent, Foreseen, Seat};
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
 use crate::env::scene::Body;
 use crate::env::{Env, World};
@@ -26,6 +26,16 @@ pub struct Recording {
     camera: Camera,
     bodies: Vec<DrawnBody>,
     frames: Vec<Frame>,
+    /// For each frame the futures that the agent weighed up there.
+    paths: Vec<Vec<Path3>>,
+}
+
+/// A future: where it leads, how good it looks (0 to 1 within its frame), how unsure it is.
+#[derive(Clone, Debug, Serialize)]
+struct Path3 {
+    points: Vec<[f64; 3]>,
+    value: f64,
+    spread: f64,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -69,9 +79,11 @@ impl Recording {
         let bodies = world.scene().iter().map(drawn).collect();
         let rest = vec![0.0; world.spec().action_size];
         let mut frames = vec![Frame { poses: poses(world), reward: 0.0, success: false, action: rest }];
+        let mut paths = Vec::new();
         loop {
             let seat = Seat { number: 0, first: frames.len() == 1, obs: &obs, world };
-            let action = agent.act_all(&[seat]).remove(0);
+            let (action, futures) = agent.act_and_show(&seat);
+            paths.push(drawn_futures(world, &futures));
             let step = world.step(&action)?;
             frames.push(Frame { poses: poses(world), reward: step.reward, success: step.success, action });
             if step.done() {
@@ -85,7 +97,7 @@ impl Recording {
             World::CartPole(_) => Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] },
         };
         let spec = world.spec();
-        Ok(Self { title, task: spec.name.clone(), dt: spec.dt, up: "z", camera, bodies, frames })
+        Ok(Self { title, task: spec.name.clone(), dt: spec.dt, up: "z", camera, bodies, frames, paths })
     }
 
     /// Steps in the episode.
@@ -133,14 +145,30 @@ impl Recording {
     }
 }
 
+/// Futures as lines in the world, their values scaled to lie between 0 and 1.
+fn drawn_futures(world: &World, futures: &[Foreseen]) -> Vec<Path3> {
+    let values = || futures.iter().map(|future| f64::from(future.value)).filter(|value| value.is_finite());
+    let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
+    let drawn = futures.iter().filter(|future| future.value.is_finite()).map(|future| Path3 {
+        points: future.observations.iter().filter_map(|obs| world.place_of(obs)).map(|p| p.map(round)).collect(),
+        value: (f64::from(future.value) - low) / (high - low).max(1e-9),
+        spread: f64::from(future.disagreement),
+    });
+    drawn.filter(|path| path.points.iter().flatten().all(|x| x.is_finite())).collect()
+}
+
 fn poses(world: &World) -> Vec<[f64; 7]> {
     world.poses().iter().map(numbers).collect()
 }
 
 fn numbers(pose: &Pose) -> [f64; 7] {
     let (p, q) = (pose.translation.vector, pose.rotation.coords);
-    // A tenth of a millimetre is finer than a screen.
-    [p.x, p.y, p.z, q.x, q.y, q.z, q.w].map(|x| (x * 1e4).round() / 1e4)
+    [p.x, p.y, p.z, q.x, q.y, q.z, q.w].map(round)
+}
+
+/// To a tenth of a millimetre, which is finer than a screen.
+fn round(x: f64) -> f64 {
+    (x * 1e4).round() / 1e4
 }
 
 fn drawn(body: &Body) -> DrawnBody {

@@ -2,7 +2,7 @@
 
 use super::task::{
     HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, object_features,
-    object_state_of, object_values, on_table, towards, vector, xyz,
+    object_state_of, object_values, on_table, towards, vector, way,
 };
 use crate::env::Feature;
 use crate::env::arm::Primitive;
@@ -46,7 +46,7 @@ impl TableTask for Lift {
     }
 
     fn features(&self) -> Vec<Feature> {
-        [gripper_features(), object_features("cube"), xyz("hand to cube", [0.0; 3], 0.1).collect()].concat()
+        [gripper_features(), object_features("cube"), way("hand", "cube").collect()].concat()
     }
 
     fn observe(&self, view: &View) -> Vec<f64> {

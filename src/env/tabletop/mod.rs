@@ -350,6 +350,12 @@ impl Snapshot for Tabletop {
 }
 
 impl Tabletop {
+    /// Where the hand is (m) in a state that is observed so, if observations are compact.
+    pub(super) fn hand_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        let compact = self.options.observation == ObservationKind::Compact;
+        compact.then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
+    }
+
     /// Acceleration of the arm's joints over the last physics step, rad/s2.
     fn joint_acceleration(&self, joints: &JointState) -> JointVector {
         (joints.qd - self.state.measured_qd) / TIMESTEP

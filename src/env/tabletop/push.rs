@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 
 use super::task::{
     HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, named, object_features, object_state_of,
-    object_values, on_table, towards, vector, xyz,
+    object_values, on_table, towards, vector, way, xyz,
 };
 use crate::env::Feature;
 use crate::env::arm::Primitive;
@@ -64,9 +64,9 @@ impl TableTask for Push {
         let table = TABLE_TOP as f32;
         object_features("cube")
             .into_iter()
-            .chain(xyz("hand to cube", [0.0; 3], 0.1))
-            .chain(xyz("goal", [0.0, 0.0, table], 0.1))
-            .chain(xyz("cube to goal", [0.0; 3], 0.1))
+            .chain(way("hand", "cube"))
+            .chain(xyz("goal", [0.0, 0.0, table], 0.1).map(Feature::constant))
+            .chain(way("cube", "goal"))
             .collect()
     }
 

@@ -4,7 +4,7 @@
 
 use nalgebra::Vector3;
 
-use super::task::{HAND_POSITION, Judgement, Setup, TableTask, View, closeness, named, towards, vector, xyz};
+use super::task::{HAND_POSITION, Judgement, Setup, TableTask, View, closeness, named, towards, vector, way, xyz};
 use crate::env::Feature;
 use crate::env::physics::Physics;
 use crate::env::scene::Body;
@@ -41,7 +41,7 @@ impl TableTask for Reach {
     }
 
     fn features(&self) -> Vec<Feature> {
-        xyz("goal", [0.0, 0.0, 1.0], 0.15).chain(xyz("hand to goal", [0.0; 3], 0.1)).collect()
+        xyz("goal", [0.0, 0.0, 1.0], 0.15).map(Feature::constant).chain(way("hand", "goal")).collect()
     }
 
     fn observe(&self, view: &View) -> Vec<f64> {

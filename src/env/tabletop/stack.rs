@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use super::lift::{CUBE, LIFTED, descend_and_close, grasped};
 use super::task::{
     Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, named, object_features,
-    object_state_of, object_values, on_table, towards, vector, xyz,
+    object_state_of, object_values, on_table, towards, vector, way,
 };
 use crate::env::Feature;
 use crate::env::arm::Primitive;
@@ -61,8 +61,8 @@ impl TableTask for Stack {
             .into_iter()
             .chain(object_features("cube"))
             .chain(object_features("base"))
-            .chain(xyz("hand to cube", [0.0; 3], 0.1))
-            .chain(xyz("cube to base", [0.0; 3], 0.1))
+            .chain(way("hand", "cube"))
+            .chain(way("cube", "base"))
             .chain([Feature::new("cube touches base").around(0.5, 0.5)])
             .collect()
     }

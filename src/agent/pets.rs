@@ -1,0 +1,367 @@
+//! PETS (Chua et al. 2018): learn an ensemble of models, plan in it at every step, learn again from what happened.
+//!
+//! Only wiring: the ensemble and its imagination are in [`crate::model`], the search is in [`crate::plan`].
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{Agent, Foreseen, Losses, Mode, Seat};
+use crate::env::{KnownReward, Spec};
+use crate::error::{Error, Result};
+use crate::model::open_loop::{OpenLoop, Trace, open_loop};
+use crate::model::uncertainty::Risk;
+use crate::model::{Differentiable, Dynamics, Ensemble, EnsembleConfig, Futures, Imagination, Propagation, Reward};
+use crate::nn::Weights;
+use crate::plan::noise::ColoredNoise;
+use crate::plan::{IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences};
+use crate::replay::{ReplayBuffer, Transition};
+use crate::rng::{self, Rng};
+
+/// Of each iteration of a planner that is watched, so many sequences are shown.
+const SHOWN: usize = 8;
+
+/// Settings of [`Pets`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PetsConfig {
+    /// The model.
+    pub ensemble: EnsembleConfig,
+    /// The planner and its settings.
+    pub planner: PlannerConfig,
+    /// Actions of a plan that are executed before the next plan is made.
+    pub replan_every: usize,
+    /// How uncertainty is carried along imagined futures.
+    pub propagation: Propagation,
+    /// Imagined futures of each candidate: a multiple of the ensemble's elites.
+    pub particles: usize,
+    /// What to make of different futures.
+    pub risk: Risk,
+    /// Return given up for each unit of disagreement between the members.
+    pub caution: f32,
+    /// Return that a unit of disagreement is worth while exploring.
+    pub curiosity: f32,
+    /// Random steps before the first plan.
+    pub warm_up: usize,
+    /// Exponent of the noise of which random actions are made: 0 is white, and barely moves an arm.
+    pub warm_up_colour: f64,
+    /// Steps between two fits of the model.
+    pub fit_every: usize,
+    /// Transitions remembered.
+    pub replay: usize,
+}
+
+impl Default for PetsConfig {
+    fn default() -> Self {
+        Self {
+            ensemble: EnsembleConfig::default(),
+            planner: PlannerConfig::Icem(IcemConfig::default()),
+            replan_every: 1,
+            propagation: Propagation::TsInf,
+            particles: 5,
+            risk: Risk::Neutral,
+            caution: 0.0,
+            curiosity: 0.0,
+            warm_up: 500,
+            warm_up_colour: 2.0,
+            fit_every: 200,
+            replay: 1_000_000,
+        }
+    }
+}
+
+impl PetsConfig {
+    fn check(&self) -> Result<()> {
+        self.planner.check()?;
+        if !self.particles.is_multiple_of(self.ensemble.elites) || self.particles == 0 {
+            return Err(Error::BadSetting(format!(
+                "pets: `particles` must be a multiple of the {} elites of the ensemble",
+                self.ensemble.elites
+            )));
+        }
+        if self.warm_up < 2 || self.fit_every == 0 {
+            return Err(Error::BadSetting("pets: `warm_up` must be at least 2, `fit_every` at least 1".into()));
+        }
+        Ok(())
+    }
+}
+
+/// Model, planner, and the experience that the model learns from.
+pub struct Pets {
+    config: PetsConfig,
+    spec: Spec,
+    reward: Arc<dyn KnownReward + Send + Sync>,
+    ensemble: Ensemble,
+    /// The snapshot to plan in, once there is something to plan in.
+    dynamics: Option<Dynamics>,
+    replay: ReplayBuffer,
+    observed: usize,
+    /// Random actions for the rest of a warm-up episode.
+    random: Vec<f32>,
+    /// Plans where it learns.
+    pilot: Pilot,
+    /// Plan where it is judged, one for each seat.
+    seats: Vec<Pilot>,
+    rng: Rng,
+}
+
+/// A controller in one world, with its own random numbers.
+struct Pilot {
+    control: RecedingHorizon,
+    rng: Rng,
+}
+
+impl Pets {
+    /// A fresh agent for an environment whose reward is `reward` (which is used only if the ensemble does not learn
+    /// rewards).
+    ///
+    /// # Errors
+    /// If a setting cannot be used.
+    pub fn new(
+        spec: &Spec,
+        reward: Arc<dyn KnownReward + Send + Sync>,
+        config: PetsConfig,
+        seed: u64,
+    ) -> Result<Self> {
+        config.check()?;
+        let mut rng = rng::stream(seed, "pets");
+        Ok(Self {
+            ensemble: Ensemble::new(spec, config.ensemble.clone(), &mut rng)?,
+            dynamics: None,
+            replay: ReplayBuffer::new(spec.observation_size(), spec.action_size, config.replay),
+            observed: 0,
+            random: Vec::new(),
+            pilot: Pilot::new(&config, spec, rng::stream(seed, "pets planner")),
+            seats: Vec::new(),
+            spec: spec.clone(),
+            reward,
+            rng,
+            config,
+        })
+    }
+
+    /// The model that it plans in, once it has one.
+    pub fn dynamics(&self) -> Option<&Dynamics> {
+        self.dynamics.as_ref()
+    }
+
+    /// Makes sure that there is a pilot for each seat, and a fresh one for an episode that begins: then the same
+    /// weights act alike in the same episode, whatever was judged before.
+    fn prepare(&mut self, seats: &[Seat]) {
+        let Self { seats: pilots, config, spec, .. } = self;
+        let fresh = |number: usize| Pilot::new(config, spec, rng::stream(number as u64, "pets seat"));
+        for seat in seats {
+            while pilots.len() <= seat.number {
+                pilots.push(fresh(pilots.len()));
+            }
+            if seat.first {
+                pilots[seat.number] = fresh(seat.number);
+            }
+        }
+    }
+
+    /// Fits the model to all experience now, and plans in the new one from here on.
+    pub fn fit(&mut self) -> Losses {
+        // Inside the thread pool, or every parallel piece of the fit would be handed over to it anew.
+        let fit = rayon::scope(|_| self.ensemble.fit(&self.replay, &mut self.rng));
+        self.dynamics = Some(self.ensemble.dynamics());
+        let mut losses = Losses::from([("model_loss", fit.loss), ("model_steps", fit.steps as f32)]);
+        if !fit.errors.is_empty() {
+            let mean = fit.errors.iter().sum::<f64>() / fit.errors.len() as f64;
+            losses.insert("model_error", mean as f32);
+        }
+        losses
+    }
+
+    /// The next number of coloured noise for each number of an action.
+    fn explore(&mut self) -> Vec<f32> {
+        let size = self.spec.action_size;
+        if self.random.is_empty() {
+            let length = self.spec.horizon.max(2);
+            let noise = ColoredNoise::new(self.config.warm_up_colour, length);
+            let columns: Vec<Vec<f64>> = (0..size).map(|_| noise.sample(&mut self.rng)).collect();
+            self.random = (0..length * size).map(|i| columns[i % size][i / size].clamp(-1.0, 1.0) as f32).collect();
+        }
+        self.random.drain(..size).collect()
+    }
+}
+
+/// What action sequences are worth in imagination.
+struct Imagined<'a> {
+    imagination: Imagination<'a>,
+    obs: &'a [f32],
+    risk: Risk,
+    /// What a unit of disagreement is worth.
+    disagreement: f32,
+    rng: Rng,
+    /// Made when the first gradient is asked for.
+    differentiable: Option<Differentiable>,
+}
+
+impl Objective for Imagined<'_> {
+    fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+        let Futures { particles, returns, disagreement } =
+            self.imagination.futures(self.obs, &sequences.values, sequences.horizon, &mut self.rng);
+        let scores = returns.chunks_exact(particles).zip(disagreement);
+        scores.map(|(returns, apart)| self.risk.of(returns) + self.disagreement * apart).collect()
+    }
+
+    fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+        let Imagination { dynamics, reward, .. } = self.imagination;
+        let model = self.differentiable.get_or_insert_with(|| Differentiable::new(dynamics));
+        let caution = if let Risk::Deviation(weight) = self.risk { weight } else { -self.disagreement };
+        model.gradients(reward, self.obs, &sequences.values, sequences.horizon, caution)
+    }
+}
+
+impl Pilot {
+    fn new(config: &PetsConfig, spec: &Spec, rng: Rng) -> Self {
+        Self { control: RecedingHorizon::new(&config.planner, spec.action_size, config.replan_every), rng }
+    }
+
+    fn act(&mut self, view: &View, obs: &[f32], curiosity: f32, observer: &mut Observer) -> Vec<f32> {
+        let mut objective = Imagined {
+            imagination: view.imagination(),
+            obs,
+            risk: view.config.risk,
+            disagreement: curiosity - view.config.caution,
+            rng: rng::fork(&mut self.rng),
+            differentiable: None,
+        };
+        self.control.act(&mut objective, observer, &mut self.rng)
+    }
+}
+
+/// All that planning needs of an agent.
+struct View<'a> {
+    config: &'a PetsConfig,
+    dynamics: &'a Dynamics,
+    reward: &'a (dyn KnownReward + Send + Sync),
+}
+
+impl<'a> View<'a> {
+    fn imagination(&self) -> Imagination<'a> {
+        Imagination {
+            dynamics: self.dynamics,
+            reward: if self.config.ensemble.learn_reward { Reward::Learned } else { Reward::Known(self.reward) },
+            propagation: self.config.propagation,
+            particles: self.config.particles,
+            value: None,
+        }
+    }
+
+    /// What the agent thinks of some action sequences from `obs`, one future each; of the first also each particle's.
+    fn foresee(&self, obs: &[f32], tried: &Sequences) -> Vec<Foreseen> {
+        let imagination = self.imagination();
+        let (states, futures) =
+            imagination.paths(obs, &tried.values, tried.horizon, &mut rng::stream(0, "pets foresight"));
+        let (width, count, particles) = (obs.len(), tried.count(), futures.particles);
+        let at = |t: usize, p: usize, c: usize| &states[t][(p * count + c) * width..][..width];
+        let mean = |t: usize, c: usize| -> Vec<f32> {
+            let sum = |i: usize| (0..particles).map(|p| at(t, p, c)[i]).sum::<f32>();
+            (0..width).map(|i| sum(i) / particles as f32).collect()
+        };
+        let returns = |c: usize| &futures.returns[c * particles..][..particles];
+        let expected = (0..count).map(|c| Foreseen {
+            observations: (0..=tried.horizon).map(|t| mean(t, c)).collect(),
+            value: Risk::Neutral.of(returns(c)),
+            disagreement: futures.disagreement[c],
+        });
+        let possible = (0..particles).map(|p| Foreseen {
+            observations: (0..=tried.horizon).map(|t| at(t, p, 0).to_vec()).collect(),
+            value: returns(0)[p],
+            disagreement: futures.disagreement[0],
+        });
+        expected.chain(possible).collect()
+    }
+}
+
+impl Agent for Pets {
+    fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
+        let Some(dynamics) = &self.dynamics else { return self.explore() };
+        let view = View { config: &self.config, dynamics, reward: self.reward.as_ref() };
+        let curiosity = if mode == Mode::Explore { self.config.curiosity } else { 0.0 };
+        self.pilot.act(&view, obs, curiosity, &mut |_| {})
+    }
+
+    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
+        self.prepare(seats);
+        let Some(dynamics) = &self.dynamics else { return vec![vec![0.0; self.spec.action_size]; seats.len()] };
+        let view = View { config: &self.config, dynamics, reward: self.reward.as_ref() };
+        let mut pilots: Vec<Option<&mut Pilot>> = self.seats.iter_mut().map(Some).collect();
+        let busy: Vec<(&Seat, &mut Pilot)> =
+            seats.iter().map(|seat| (seat, pilots[seat.number].take().expect("seats have different numbers"))).collect();
+        busy.into_par_iter().map(|(seat, pilot)| pilot.act(&view, seat.obs, 0.0, &mut |_| {})).collect()
+    }
+
+    fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
+        self.prepare(&[*seat]);
+        let Some(dynamics) = &self.dynamics else { return (vec![0.0; self.spec.action_size], Vec::new()) };
+        let view = View { config: &self.config, dynamics, reward: self.reward.as_ref() };
+        // The plan, and of each iteration a few that were tried, from the best to the worst.
+        let mut shown: Option<Sequences> = None;
+        let mut observer = |iteration: &Iteration| {
+            let tried = iteration.candidates;
+            let mut order: Vec<usize> = (0..tried.count()).collect();
+            order.sort_by(|a, b| iteration.returns[*b].total_cmp(&iteration.returns[*a]));
+            let some = order.iter().step_by((tried.count() / SHOWN).max(1)).flat_map(|&i| tried.row(i));
+            let shown = shown.get_or_insert_with(|| Sequences::new(tried.horizon, tried.actions));
+            // The newest, and so the best, come first.
+            shown.values.splice(0..0, some.copied());
+        };
+        let action = self.seats[seat.number].act(&view, seat.obs, 0.0, &mut observer);
+        (action, shown.map(|shown| view.foresee(seat.obs, &shown)).unwrap_or_default())
+    }
+
+    fn observe(&mut self, transition: &Transition) {
+        self.replay.push(transition);
+        self.observed += 1;
+        if transition.terminated || transition.truncated {
+            self.pilot.control.reset();
+            self.random.clear();
+        }
+    }
+
+    fn update(&mut self) -> Option<Losses> {
+        let since = self.observed.checked_sub(self.config.warm_up)?;
+        since.is_multiple_of(self.config.fit_every).then(|| self.fit())
+    }
+
+    fn judge_model(&self, traces: &[Trace]) -> Vec<OpenLoop> {
+        let judge = |dynamics| open_loop(dynamics, traces, &mut rng::stream(0, "open loop"));
+        self.dynamics.as_ref().map(judge).unwrap_or_default()
+    }
+
+    fn weights(&self) -> Weights {
+        self.ensemble.weights()
+    }
+
+    fn load_weights(&mut self, weights: &Weights) -> Result<()> {
+        self.ensemble.load_weights(weights)?;
+        self.dynamics = self.ensemble.is_fitted().then(|| self.ensemble.dynamics());
+        Ok(())
+    }
+
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        self.ensemble.save_training_state(&mut state);
+        self.replay.save(&mut state, "replay");
+        state.insert_counts("counts", &[self.observed as u64]);
+        state.insert_counts("rng", &rng::state(&self.rng));
+        state.insert_counts("planner rng", &rng::state(&self.pilot.rng));
+        state
+    }
+
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        let counts = state.counts("counts", 1)?;
+        let (own, planner) = (state.counts("rng", 4)?, state.counts("planner rng", 4)?);
+        self.ensemble.load_training_state(state)?;
+        self.replay.load(state, "replay")?;
+        self.observed = counts[0] as usize;
+        self.rng = rng::from_state(&own);
+        self.pilot = Pilot::new(&self.config, &self.spec, rng::from_state(&planner));
+        self.random.clear();
+        Ok(())
+    }
+}

@@ -1,0 +1,184 @@
+//! A snapshot of an ensemble that predicts: plain weights, no tape, fused layers.
+
+use dfdx::tensor::Cpu;
+
+use super::{Layout, Normaliser};
+use super::uncertainty::split;
+use crate::nn::kernels::{self, Matrix, vectorised_fn};
+use crate::nn::{Activation, Mlp, bounded};
+
+/// Elites of an ensemble, frozen. All predictions are in physical units unless said otherwise.
+#[derive(Clone, Debug)]
+pub struct Dynamics {
+    members: Vec<Vec<Layer>>,
+    pub(super) layout: Layout,
+    actions: usize,
+    pub(super) inputs: Normaliser,
+    pub(super) targets: Normaliser,
+    /// Upper and lower bounds of log-variances.
+    bounds: [Vec<f32>; 2],
+    temperature: Vec<f32>,
+}
+
+/// Weight `[input, output]` and bias `[output]`.
+#[derive(Clone, Debug)]
+struct Layer {
+    weight: Vec<f32>,
+    bias: Vec<f32>,
+}
+
+/// What all members together say of one step, for each number of an observation that is predicted (see
+/// [`Dynamics::typical_changes`]; and then of the reward, if it was learned).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Prediction {
+    /// The expected observation after the step.
+    pub mean: Vec<f64>,
+    /// Variance by chance: the mean of the members' variances.
+    pub aleatoric: Vec<f64>,
+    /// Variance by ignorance: the variance of the members' means.
+    pub epistemic: Vec<f64>,
+}
+
+/// Buffers of a forward pass, to be used again.
+#[derive(Debug, Default)]
+pub(super) struct Scratch {
+    /// Inputs, and every second layer's outputs.
+    pub(super) x: Vec<f32>,
+    y: Vec<f32>,
+}
+
+impl Dynamics {
+    #[allow(clippy::too_many_arguments)] // made in one place, by the ensemble
+    pub(super) fn new<'a>(
+        members: impl Iterator<Item = impl Iterator<Item = (&'a [f32], &'a [f32])>>,
+        layout: Layout,
+        actions: usize,
+        inputs: Normaliser,
+        targets: Normaliser,
+        [max, min]: [&[f32]; 2],
+        temperature: Vec<f32>,
+    ) -> Self {
+        let layer = |(weight, bias): (&[f32], &[f32])| Layer { weight: weight.to_vec(), bias: bias.to_vec() };
+        let members = members.map(|layers| layers.map(layer).collect()).collect();
+        Self { members, layout, actions, inputs, targets, bounds: [max.to_vec(), min.to_vec()], temperature }
+    }
+
+    /// Networks.
+    pub fn members(&self) -> usize {
+        self.members.len()
+    }
+
+    /// Numbers in an observation.
+    pub fn observation_size(&self) -> usize {
+        self.layout.width
+    }
+
+    /// Numbers in an action.
+    pub fn action_size(&self) -> usize {
+        self.actions
+    }
+
+    /// Whether the reward was learned as well.
+    pub fn predicts_reward(&self) -> bool {
+        self.outputs() > self.layout.predicted.len()
+    }
+
+    /// The numbers of an observation that it predicts (the others follow from them), and the standard deviation of
+    /// the change of each in the data.
+    pub fn typical_changes(&self) -> impl Iterator<Item = (usize, f32)> + Clone + '_ {
+        self.layout.predicted.iter().copied().zip(self.targets.scale.iter().copied())
+    }
+
+    /// What the members say of one step from `obs` by `action`.
+    pub fn predict(&self, obs: &[f32], action: &[f32]) -> Prediction {
+        let (means, variances) = self.opinions(obs, action);
+        let [mean, aleatoric, epistemic] = split(&means, &variances);
+        Prediction { mean, aleatoric, epistemic }
+    }
+
+    /// Mean and variance that each member gives for what is predicted of the observation after a step (and the reward, if
+    /// learned).
+    pub fn opinions(&self, obs: &[f32], action: &[f32]) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
+        let outputs = self.outputs();
+        let mut scratch = Scratch::default();
+        let opinion = |member: usize| {
+            scratch.x.clear();
+            self.push_input(&mut scratch.x, obs, action);
+            let head = self.forward(member, &mut scratch);
+            self.to_physical(head);
+            let (change, deviation) = head.split_at(outputs);
+            // A reward is predicted as it is, an observation by its change.
+            let before = self.layout.predicted.iter().map(|i| obs[*i]).chain(std::iter::repeat(0.0));
+            let mean = change.iter().zip(before).map(|(change, before)| f64::from(before) + f64::from(*change));
+            (mean.collect(), deviation.iter().map(|d| f64::from(*d).powi(2)).collect())
+        };
+        (0..self.members()).map(opinion).unzip()
+    }
+
+    /// The same networks on dfdx, to be differentiated.
+    pub(super) fn networks(&self, cpu: &Cpu) -> Mlp {
+        let members: Vec<Vec<(&[f32], &[f32])>> = self
+            .members
+            .iter()
+            .map(|layers| layers.iter().map(|layer| (&layer.weight[..], &layer.bias[..])).collect())
+            .collect();
+        Mlp::from_layers(cpu, &members, Activation::Silu)
+    }
+
+    /// Numbers that are predicted.
+    pub(super) fn outputs(&self) -> usize {
+        self.targets.mean.len()
+    }
+
+    /// Adds a row of network input.
+    pub(super) fn push_input(&self, x: &mut Vec<f32>, obs: &[f32], action: &[f32]) {
+        let features = self.inputs.mean.iter().zip(&self.inputs.scale);
+        let read = self.layout.inputs.iter().map(|i| obs[*i]).chain(action.iter().copied());
+        x.extend(read.zip(features).map(|(x, (mean, scale))| (x - mean) / scale));
+    }
+
+    /// One member's answers for the rows in `scratch.x`, `[rows, 2 outputs]`: normalised mean, and raw log-variance.
+    pub(super) fn forward<'a>(&self, member: usize, scratch: &'a mut Scratch) -> &'a mut [f32] {
+        let layers = &self.members[member];
+        let Scratch { x, y } = scratch;
+        for (i, Layer { weight, bias }) in layers.iter().enumerate() {
+            let outputs = bias.len();
+            let inputs = weight.len() / outputs;
+            y.resize(x.len() / inputs * outputs, 0.0);
+            kernels::matmul(y, Matrix::new(x, inputs), Matrix::new(weight, outputs), false);
+            let activation = if i + 1 < layers.len() { Activation::Silu } else { Activation::Identity };
+            kernels::add_and_activate(y, bias, activation);
+            std::mem::swap(x, y);
+        }
+        x
+    }
+
+    /// Rows of what [`Dynamics::forward`] answered, in place: normalised means become changes, raw log-variances become
+    /// standard deviations.
+    pub(super) fn to_physical(&self, head: &mut [f32]) {
+        let [max, min] = &self.bounds;
+        denormalise(head, &self.targets.mean, &self.targets.scale, max, min, &self.temperature);
+    }
+}
+
+vectorised_fn! {
+    fn denormalise(
+        head: &'a mut [f32],
+        mean: &'a [f32],
+        scale: &'a [f32],
+        max: &'a [f32],
+        min: &'a [f32],
+        temperature: &'a [f32],
+    ) {
+        let n = mean.len();
+        let (scale, max, min, temperature) = (&scale[..n], &max[..n], &min[..n], &temperature[..n]);
+        for row in head.chunks_exact_mut(2 * n) {
+            let (means, raw) = row.split_at_mut(n);
+            let raw = &mut raw[..n];
+            for i in 0..n {
+                means[i] = means[i].mul_add(scale[i], mean[i]);
+                raw[i] = kernels::exp(0.5 * bounded(raw[i], max[i], min[i])) * temperature[i] * scale[i];
+            }
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! What of an observation a model reads, what it predicts, and what follows from the rest.
+//!
+//! A goal does not move, and the way from the hand to a cube is the difference of two positions: a network that had to
+//! learn that would find it true only about, and would take a goal for the reason of what happened near it.
+
+use crate::env::{Role, Spec};
+use crate::error::{Error, Result};
+
+/// Which numbers of an observation are which.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Layout {
+    /// Numbers in an observation.
+    pub width: usize,
+    /// Those that networks read: what has a course of its own, and differences of such.
+    pub inputs: Vec<usize>,
+    /// Those that networks predict: what has a course of its own.
+    pub predicted: Vec<usize>,
+    /// Those that are the difference of two others: `[itself, minuend, subtrahend]`.
+    pub differences: Vec<[usize; 3]>,
+}
+
+impl Layout {
+    /// The layout of an environment's observations.
+    ///
+    /// # Errors
+    /// If a difference names a feature that does not exist or is itself a difference.
+    pub fn new(spec: &Spec) -> Result<Self> {
+        let features = &spec.observation;
+        let (mut inputs, mut predicted, mut differences) = (Vec::new(), Vec::new(), Vec::new());
+        let find = |name: &str| {
+            let known = features.iter().position(|f| f.name == name && !matches!(f.role, Role::Difference { .. }));
+            known.ok_or_else(|| Error::BadSetting(format!("{}: no feature `{name}` to take a difference of", spec.name)))
+        };
+        for (i, feature) in features.iter().enumerate() {
+            match &feature.role {
+                Role::State => {
+                    inputs.push(i);
+                    predicted.push(i);
+                }
+                Role::Constant => {}
+                Role::Difference { minuend, subtrahend } => {
+                    let (a, b) = (find(minuend)?, find(subtrahend)?);
+                    differences.push([i, a, b]);
+                    if [a, b].iter().all(|part| features[*part].role == Role::State) {
+                        inputs.push(i);
+                    }
+                }
+            }
+        }
+        if predicted.is_empty() {
+            return Err(Error::BadSetting(format!("{}: nothing in an observation has a course of its own", spec.name)));
+        }
+        Ok(Self { width: features.len(), inputs, predicted, differences })
+    }
+
+    /// Puts right, in an observation whose predicted numbers are new, what follows from them.
+    pub fn complete(&self, obs: &mut [f32]) {
+        for &[i, a, b] in &self.differences {
+            obs[i] = obs[a] - obs[b];
+        }
+    }
+}

@@ -1,0 +1,21 @@
+//! What was learned of the world: models that predict what comes next, and say how sure they are.
+//!
+//! [`Ensemble`] learns; its snapshot [`Dynamics`] predicts; [`Imagination`] lets a snapshot run ahead along many action
+//! sequences at once. [`uncertainty`] and [`calibration`] tell what the predictions are worth.
+
+pub mod calibration;
+mod differentiable;
+mod dynamics;
+mod ensemble;
+mod imagination;
+mod layout;
+mod normaliser;
+pub mod open_loop;
+pub mod uncertainty;
+
+pub use differentiable::Differentiable;
+pub use dynamics::{Dynamics, Prediction};
+pub use ensemble::{Ensemble, EnsembleConfig, Fit};
+pub use imagination::{Futures, Imagination, Propagation, Reward};
+pub use layout::Layout;
+pub use normaliser::Normaliser;

@@ -1,0 +1,122 @@
+//! Planning by gradient ascent on the actions themselves, for objectives that can be differentiated.
+//!
+//! Gradients find the errors of a learned model faster than anything else, and contact hides from them what
+//! lies beyond it; so there are several starts, clipped gradients, and few steps.
+
+use serde::{Deserialize, Serialize};
+
+use super::noise::ColoredNoise;
+use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, best, shifted};
+use crate::rng::Rng;
+
+/// Settings of [`Gradient`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GradientConfig {
+    /// Steps that it looks ahead.
+    pub horizon: usize,
+    /// Sequences that climb side by side: the plan before, and random ones.
+    pub starts: usize,
+    /// Steps of ascent.
+    pub iterations: usize,
+    /// Step size (Adam).
+    pub rate: f64,
+    /// A sequence's gradient with a larger norm is scaled down to it.
+    pub max_norm: f64,
+    /// Standard deviation of the random starts, and the exponent of their noise.
+    pub deviation: f64,
+    /// See [`ColoredNoise`].
+    pub colour: f64,
+}
+
+impl Default for GradientConfig {
+    fn default() -> Self {
+        Self { horizon: 15, starts: 8, iterations: 20, rate: 0.1, max_norm: 10.0, deviation: 0.5, colour: 2.0 }
+    }
+}
+
+/// The planner.
+pub struct Gradient {
+    config: GradientConfig,
+    actions: usize,
+    noise: ColoredNoise,
+    /// The plan before.
+    before: Vec<f64>,
+}
+
+impl Gradient {
+    /// For actions of so many numbers.
+    pub fn new(config: GradientConfig, actions: usize) -> Self {
+        let noise = ColoredNoise::new(config.colour, config.horizon);
+        Self { before: vec![0.0; config.horizon * actions], noise, actions, config }
+    }
+}
+
+impl Planner for Gradient {
+    fn reset(&mut self) {
+        self.before.fill(0.0);
+    }
+
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+        let GradientConfig { horizon, starts, deviation, .. } = self.config;
+        let mut sequences = Sequences::new(horizon, self.actions);
+        sequences.values.extend(self.before.iter().map(|a| *a as f32));
+        for _ in 1..starts {
+            let columns: Vec<Vec<f64>> = (0..self.actions).map(|_| self.noise.sample(rng)).collect();
+            let noise = (0..self.before.len()).map(|i| deviation * columns[i % self.actions][i / self.actions]);
+            sequences.values.extend(noise.map(|a| a.clamp(-1.0, 1.0) as f32));
+        }
+        let plan = ascend(sequences, &self.config, objective, observer);
+        self.before = plan.actions.iter().map(|a| f64::from(*a)).collect();
+        plan
+    }
+
+    fn shift(&mut self, steps: usize) {
+        let last = self.before[self.before.len() - self.actions..].to_vec();
+        shifted(&mut self.before, steps, self.actions, &last);
+    }
+}
+
+/// Climbs from the given sequences by Adam, within the bounds; the best of where they arrive, and of what was best on the
+/// way.
+pub(super) fn ascend(
+    mut sequences: Sequences,
+    config: &GradientConfig,
+    objective: &mut dyn Objective,
+    observer: &mut Observer,
+) -> Plan {
+    let width = sequences.width();
+    let mut moments = vec![[0.0; 2]; sequences.values.len()];
+    let mut plan = Plan { actions: sequences.row(0).to_vec(), promised: f32::NEG_INFINITY };
+    for index in 0..config.iterations {
+        let (returns, gradients) = objective.gradients(&sequences);
+        let winner = best(&returns, 1)[0];
+        if returns[winner] > plan.promised {
+            plan = Plan { actions: sequences.row(winner).to_vec(), promised: returns[winner] };
+        }
+        let mean: Vec<f64> = plan.actions.iter().map(|a| f64::from(*a)).collect();
+        observer(&Iteration { index, candidates: &sequences, returns: &returns, mean: &mean });
+        let corrections = [0.9_f64, 0.999].map(|beta| 1.0 - beta.powi(index as i32 + 1));
+        for (row, gradient) in gradients.chunks_exact(width).enumerate() {
+            let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+            if !norm.is_finite() {
+                continue;
+            }
+            let clip = (config.max_norm / norm.max(f64::MIN_POSITIVE)).min(1.0);
+            for (i, g) in gradient.iter().enumerate() {
+                let g = clip * f64::from(*g);
+                let [first, second] = &mut moments[row * width + i];
+                *first += 0.1 * (g - *first);
+                *second += 0.001 * (g * g - *second);
+                let step = *first / corrections[0] / ((*second / corrections[1]).sqrt() + 1e-8);
+                let action = &mut sequences.values[row * width + i];
+                *action = (f64::from(*action) + config.rate * step).clamp(-1.0, 1.0) as f32;
+            }
+        }
+    }
+    // What an objective differentiates need not be all that it judges by.
+    sequences.values.extend(plan.actions);
+    let returns = objective.returns(&sequences);
+    let winner = best(&returns, 1)[0];
+    Plan { actions: sequences.row(winner).to_vec(), promised: returns[winner] }
+}

@@ -1,0 +1,187 @@
+//! What a learned model must be: right where it has seen enough, unsure where it has not, and honest about chance.
+
+use handful::env::{Feature, KnownReward, Spec};
+use handful::model::calibration::{Judged, coverage};
+use handful::model::open_loop::{Trace, open_loop};
+use handful::model::{Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward};
+use handful::replay::{ReplayBuffer, Transition};
+use handful::rng::{self, Rng};
+
+/// Two numbers: the first is moved by the action and by chance, the second turns with the first and is left alone by
+/// both.
+const CHANCE: f64 = 0.02;
+
+fn spec() -> Spec {
+    Spec {
+        name: "test".into(),
+        observation: vec![Feature::new("moved"), Feature::new("turned"), Feature::new("still")],
+        action_size: 1,
+        horizon: 50,
+        dt: 0.1,
+        stages: vec![],
+    }
+}
+
+fn expected(obs: &[f32], action: f32) -> [f32; 3] {
+    [0.9 * obs[0] + 0.3 * action, obs[1] + 0.2 * (2.0 * obs[0]).sin(), obs[2]]
+}
+
+fn step(obs: &[f32], action: f32, rng: &mut Rng) -> Vec<f32> {
+    let mut next = expected(obs, action);
+    next[0] += (CHANCE * rng::normal(rng)) as f32;
+    next.to_vec()
+}
+
+struct Reach;
+
+impl KnownReward for Reach {
+    fn reward(&self, _obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32 {
+        -(next_obs[0] - 0.5).powi(2) - 0.1 * next_obs[1] - 0.01 * action[0].powi(2)
+    }
+}
+
+fn experience(count: usize, rng: &mut Rng) -> (ReplayBuffer, Vec<Trace>) {
+    let mut data = ReplayBuffer::new(3, 1, count);
+    let mut traces = Vec::new();
+    while data.len() < count {
+        let mut obs = vec![rng::uniform(rng, -1.0, 1.0) as f32, rng::uniform(rng, -1.0, 1.0) as f32, 7.0];
+        let mut trace = Trace { observations: vec![obs.clone()], actions: Vec::new() };
+        for _ in 0..spec().horizon {
+            let action = vec![rng::uniform(rng, -1.0, 1.0) as f32];
+            let next_obs = step(&obs, action[0], rng);
+            let reward = Reach.reward(&obs, &action, &next_obs);
+            trace.observations.push(next_obs.clone());
+            trace.actions.push(action.clone());
+            let terminated = false;
+            data.push(&Transition { obs, action, reward, next_obs: next_obs.clone(), terminated, truncated: false });
+            obs = next_obs;
+        }
+        traces.push(trace);
+    }
+    (data, traces)
+}
+
+fn config() -> EnsembleConfig {
+    EnsembleConfig { hidden: vec![48, 48], first_steps: 1500, batch: 128, ..EnsembleConfig::default() }
+}
+
+fn fitted(config: EnsembleConfig) -> Ensemble {
+    let mut rng = rng::stream(0, "model");
+    let (data, _) = experience(2000, &mut rng);
+    let mut ensemble = Ensemble::new(&spec(), config, &mut rng).expect("usable settings");
+    let fit = ensemble.fit(&data, &mut rng);
+    assert!(fit.steps > 0 && fit.loss.is_finite());
+    ensemble
+}
+
+#[test]
+fn an_ensemble_learns_what_is_law_and_what_is_chance() {
+    for learn_bounds in [false, true] {
+        let ensemble = fitted(EnsembleConfig { learn_bounds, ..config() });
+        let dynamics = ensemble.dynamics();
+        let mut rng = rng::stream(1, "test");
+        let mut judged = Vec::new();
+        for _ in 0..500 {
+            let obs = [rng::uniform(&mut rng, -0.8, 0.8) as f32, rng::uniform(&mut rng, -0.8, 0.8) as f32, 7.0];
+            let action = rng::uniform(&mut rng, -1.0, 1.0) as f32;
+            let said = dynamics.predict(&obs, &[action]);
+            let law = expected(&obs, action);
+            for i in 0..3 {
+                assert!((said.mean[i] - f64::from(law[i])).abs() < 0.02, "number {i}: {} for {}", said.mean[i], law[i]);
+            }
+            let deviation = said.aleatoric[0].sqrt();
+            assert!((0.5 * CHANCE..2.0 * CHANCE).contains(&deviation), "chance is {CHANCE}, not {deviation}");
+            assert!(said.epistemic[0] < said.aleatoric[0], "with so much data, chance is the greater part");
+            let total = (said.aleatoric[0] + said.epistemic[0]).sqrt();
+            let outcome = f64::from(step(&obs, action, &mut rng)[0]);
+            judged.push(Judged { mean: said.mean[0], deviation: total, outcome });
+        }
+        let inside = coverage(&judged, 0.9);
+        assert!((0.84..0.97).contains(&inside), "{inside} of the outcomes lie in the interval of 90 %");
+    }
+}
+
+#[test]
+fn members_disagree_where_nothing_was_seen() {
+    let dynamics = fitted(config()).dynamics();
+    let unsure = |x: f32| dynamics.predict(&[x, 0.0, 7.0], &[0.0]).epistemic[1].sqrt();
+    assert!(unsure(6.0) > 5.0 * unsure(0.2), "{} far away, {} at home", unsure(6.0), unsure(0.2));
+}
+
+#[test]
+fn the_best_members_predict_and_all_survive_a_save() {
+    let mut rng = rng::stream(0, "model");
+    let (data, _) = experience(600, &mut rng);
+    let config = EnsembleConfig { members: 4, elites: 2, first_steps: 300, ..config() };
+    let mut ensemble = Ensemble::new(&spec(), config.clone(), &mut rng).expect("usable settings");
+    let errors = ensemble.fit(&data, &mut rng).errors;
+    assert_eq!((errors.len(), ensemble.dynamics().members()), (4, 2));
+    let mut copy = Ensemble::new(&spec(), config, &mut rng).expect("usable settings");
+    copy.load_weights(&ensemble.weights()).expect("its own weights");
+    let (obs, action) = ([0.3, 0.1, 7.0], [0.4]);
+    assert_eq!(copy.dynamics().predict(&obs, &action), ensemble.dynamics().predict(&obs, &action));
+    let before = ensemble.dynamics().predict(&obs, &action);
+    ensemble.fit(&data, &mut rng);
+    let after = ensemble.dynamics().predict(&obs, &action);
+    assert!((before.mean[0] - after.mean[0]).abs() < 0.05, "a second fit goes on from the first");
+}
+
+#[test]
+fn a_model_is_judged_over_many_steps() {
+    let mut rng = rng::stream(5, "model");
+    let (data, _) = experience(2000, &mut rng);
+    let (_, unseen) = experience(500, &mut rng);
+    let mut ensemble = Ensemble::new(&spec(), config(), &mut rng).expect("usable settings");
+    ensemble.fit(&data, &mut rng);
+    let judged = open_loop(&ensemble.dynamics(), &unseen, &mut rng);
+    let horizons: Vec<usize> = judged.iter().map(|row| row.horizon).collect();
+    assert_eq!(horizons, [1, 2, 5, 10, 15, 25]);
+    for row in judged {
+        assert!(row.rmse < 0.5, "better than foreseeing no change: {row:?}");
+        assert!((0.75..=1.0).contains(&row.coverage90), "{row:?}");
+    }
+}
+
+/// The tape's gradients against central differences, for known and for learned rewards.
+#[test]
+fn gradients_of_imagined_returns_are_exact() {
+    let known = fitted(config()).dynamics();
+    let learned = fitted(EnsembleConfig { learn_reward: true, ..config() }).dynamics();
+    assert!(learned.predicts_reward() && !known.predicts_reward());
+    let actions: Vec<f32> = (0..12).map(|i| 0.8 * (i as f32).sin()).collect();
+    let obs = [0.2, -0.1, 7.0];
+    for (dynamics, reward) in [(&known, Reward::Known(&Reach)), (&learned, Reward::Learned)] {
+        let model = Differentiable::new(dynamics);
+        for caution in [0.0, 0.5] {
+            let (returns, slopes) = model.gradients(reward, &obs, &actions, 6, caution);
+            assert_eq!((returns.len(), slopes.len()), (2, 12));
+            let largest = slopes.iter().fold(0.0_f32, |a, s| a.max(s.abs()));
+            for i in 0..12 {
+                let at = |by: f32| {
+                    let mut moved = actions.clone();
+                    moved[i] += by;
+                    f64::from(model.gradients(reward, &obs, &moved, 6, caution).0[i / 6])
+                };
+                let difference = (at(1e-2) - at(-1e-2)) / 2e-2;
+                let error = (f64::from(slopes[i]) - difference).abs() / f64::from(largest);
+                assert!(error < 0.03, "action {i}: {} by the tape, {difference} by differences", slopes[i]);
+            }
+        }
+    }
+}
+
+/// A learned reward agrees with the known one that it was learned from.
+#[test]
+fn rewards_can_be_learned() {
+    let dynamics = fitted(EnsembleConfig { learn_reward: true, ..config() }).dynamics();
+    let actions: Vec<f32> = (0..40).map(|i| (i as f32 * 1.3).sin()).collect();
+    let returns = |reward| {
+        let propagation = Propagation::Mean;
+        let imagination = Imagination { dynamics: &dynamics, reward, propagation, particles: 5, value: None };
+        imagination.futures(&[0.1, 0.0, 7.0], &actions, 10, &mut rng::stream(3, "luck")).returns
+    };
+    let (known, learned) = (returns(Reward::Known(&Reach)), returns(Reward::Learned));
+    for (known, learned) in known.iter().zip(&learned) {
+        assert!((known - learned).abs() < 0.15, "{learned} learned, {known} known");
+    }
+}
