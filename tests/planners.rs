@@ -1,7 +1,7 @@
 //! Every planner finds known optima, and none needs to know what it plans for.
 
 use handful::plan::{
-    CemConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig, Objective, Plan, PlannerConfig,
+    CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig, Objective, Plan, PlannerConfig,
     RecedingHorizon, Sequences, ShootingConfig,
 };
 use handful::rng;
@@ -51,17 +51,23 @@ fn the_hybrid_trusts_no_slope_that_does_not_keep_its_word() {
 #[test]
 fn a_receding_horizon_plans_only_when_it_is_time() {
     let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 50 });
-    let mut control = RecedingHorizon::new(&config, 2, 3);
+    let mut control = RecedingHorizon::new(&config, 2, &ControlConfig { hold: 2, replan_every: 3 });
     let mut rng = rng::stream(0, "receding");
     let mut plans = 0;
     let target = target();
-    for step in 0..7 {
+    let mut before = Vec::new();
+    for step in 0..13 {
         let mut objective = |c: &Sequences| {
             plans += 1;
+            assert!(c.horizon == 2 * HORIZON && c.rows().all(|row| row[..2] == row[2..4]), "actions are held for two steps");
             bowl(c, &target)
         };
-        assert_eq!(control.act(&mut objective, &mut |_| {}, &mut rng).len(), 2);
-        assert_eq!(plans, step / 3 + 1);
+        let action = control.act(&mut objective, &mut |_| {}, &mut rng);
+        assert_eq!(plans, step / 6 + 1);
+        if step % 2 == 1 {
+            assert_eq!(action, before, "each is held");
+        }
+        before = action;
     }
     control.reset();
     control.act(&mut |c: &Sequences| bowl(c, &target), &mut |_| plans += 1, &mut rng);

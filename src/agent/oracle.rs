@@ -14,7 +14,7 @@ use super::{Agent, Mode, Seat};
 use crate::env::tabletop::TableOptions;
 use crate::env::{Env, Snapshot, Task, World, WorldState};
 use crate::error::Result;
-use crate::plan::{IcemConfig, PlannerConfig, RecedingHorizon, Sequences};
+use crate::plan::{ControlConfig, IcemConfig, PlannerConfig, RecedingHorizon, Sequences};
 use crate::rng::{self, Rng};
 
 /// Settings of [`Oracle`].
@@ -23,13 +23,13 @@ use crate::rng::{self, Rng};
 pub struct OracleConfig {
     /// The planner and its settings.
     pub planner: PlannerConfig,
-    /// Actions of a plan that are executed before the next plan is made.
-    pub replan_every: usize,
+    /// How plans become control.
+    pub control: ControlConfig,
 }
 
 impl Default for OracleConfig {
     fn default() -> Self {
-        Self { planner: PlannerConfig::Icem(IcemConfig::default()), replan_every: 1 }
+        Self { planner: PlannerConfig::Icem(IcemConfig::default()), control: ControlConfig::default() }
     }
 }
 
@@ -49,7 +49,7 @@ impl Oracle {
     /// # Errors
     /// If a setting cannot be used.
     pub fn new(task: Task, options: TableOptions, config: OracleConfig, seed: u64) -> Result<Self> {
-        config.planner.check()?;
+        config.control.check(&config.planner)?;
         let worlds = (0..rayon::current_num_threads()).map(|_| task.make_with(options)).collect::<Result<Vec<_>>>()?;
         let actions = worlds[0].spec().action_size;
         Ok(Self { config, actions, controllers: BTreeMap::new(), worlds, rng: rng::stream(seed, "oracle") })
@@ -57,7 +57,7 @@ impl Oracle {
 
     fn plan(&mut self, seat: &Seat) -> Vec<f32> {
         let Self { config, actions, controllers, worlds, rng } = self;
-        let new = || RecedingHorizon::new(&config.planner, *actions, config.replan_every);
+        let new = || RecedingHorizon::new(&config.planner, *actions, &config.control);
         let controller = controllers.entry(seat.number).or_insert_with(new);
         if seat.first {
             controller.reset();

@@ -15,7 +15,7 @@ use crate::model::uncertainty::Risk;
 use crate::model::{Differentiable, Dynamics, Ensemble, EnsembleConfig, Futures, Imagination, Propagation, Reward};
 use crate::nn::Weights;
 use crate::plan::noise::ColoredNoise;
-use crate::plan::{IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences};
+use crate::plan::{ControlConfig, IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences};
 use crate::replay::{ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
 
@@ -30,8 +30,8 @@ pub struct PetsConfig {
     pub ensemble: EnsembleConfig,
     /// The planner and its settings.
     pub planner: PlannerConfig,
-    /// Actions of a plan that are executed before the next plan is made.
-    pub replan_every: usize,
+    /// How plans become control.
+    pub control: ControlConfig,
     /// How uncertainty is carried along imagined futures.
     pub propagation: Propagation,
     /// Imagined futures of each candidate: a multiple of the ensemble's elites.
@@ -57,7 +57,7 @@ impl Default for PetsConfig {
         Self {
             ensemble: EnsembleConfig::default(),
             planner: PlannerConfig::Icem(IcemConfig::default()),
-            replan_every: 1,
+            control: ControlConfig::default(),
             propagation: Propagation::TsInf,
             particles: 5,
             risk: Risk::Neutral,
@@ -73,7 +73,7 @@ impl Default for PetsConfig {
 
 impl PetsConfig {
     fn check(&self) -> Result<()> {
-        self.planner.check()?;
+        self.control.check(&self.planner)?;
         if !self.particles.is_multiple_of(self.ensemble.elites) || self.particles == 0 {
             return Err(Error::BadSetting(format!(
                 "pets: `particles` must be a multiple of the {} elites of the ensemble",
@@ -217,7 +217,7 @@ impl Objective for Imagined<'_> {
 
 impl Pilot {
     fn new(config: &PetsConfig, spec: &Spec, rng: Rng) -> Self {
-        Self { control: RecedingHorizon::new(&config.planner, spec.action_size, config.replan_every), rng }
+        Self { control: RecedingHorizon::new(&config.planner, spec.action_size, &config.control), rng }
     }
 
     fn act(&mut self, view: &View, obs: &[f32], curiosity: f32, observer: &mut Observer) -> Vec<f32> {

@@ -16,7 +16,7 @@ pub mod noise;
 mod shooting;
 
 pub use cem::{Cem, CemConfig};
-pub use control::RecedingHorizon;
+pub use control::{ControlConfig, RecedingHorizon};
 pub use gradient::{Gradient, GradientConfig};
 pub use hybrid::{Hybrid, HybridConfig};
 pub use icem::{Icem, IcemConfig};

@@ -157,6 +157,76 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
     })
 }
 
+/// The steps ahead for which a model's error is drawn.
+const FORESIGHT: [u32; 3] = [1, 5, 15];
+
+/// What a method's model is worth over training: its error so many steps ahead, and how often the truth lies inside its
+/// interval of 90 %. False, and nothing drawn, if the method has no model.
+///
+/// # Errors
+/// If the tables lack a column or the file cannot be written.
+pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<bool> {
+    let mut lines = Vec::new();
+    for (color, horizon) in PALETTE.into_iter().zip(FORESIGHT) {
+        let error = tables.model_curves(task, method, horizon, "rmse")?;
+        let coverage = tables.model_curves(task, method, horizon, "coverage90")?;
+        if !error.is_empty() {
+            lines.push((color, horizon, [band(&error), band(&coverage)]));
+        }
+    }
+    let steps = lines.iter().flat_map(|(_, _, bands)| bands[0].0.iter().copied());
+    let (first, last) = (steps.clone().fold(f64::INFINITY, f64::min), steps.fold(0.0, f64::max));
+    if lines.is_empty() {
+        return Ok(false);
+    }
+    let worst = lines.iter().flat_map(|(_, _, bands)| &bands[0].1).map(|[.., high]| *high).fold(1.05, f64::max);
+    draw(path, |area| {
+        let title = format!("{task}: what the model of {method} foresees in episodes that it has not learned from");
+        let area = area.margin(14, 10, 10, 10).titled(&title, (FONT, 20))?;
+        let panels = area.split_evenly((1, 2));
+        let about = [("error (1: as good as foreseeing no change)", worst.min(4.0), 1.0), ("truth inside the 90 % interval", 1.03, 0.9)];
+        for (which, (panel, (title, top, mark))) in panels.iter().zip(about).enumerate() {
+            let mut chart = ChartBuilder::on(panel)
+                .caption(title, (FONT, 15))
+                .margin(8)
+                .x_label_area_size(40)
+                .y_label_area_size(50)
+                .build_cartesian_2d(first.min(last - 1.0)..last, 0.0..top)?;
+            chart
+                .configure_mesh()
+                .light_line_style(WHITE)
+                .bold_line_style(GREY.mix(0.2))
+                .axis_style(GREY)
+                .x_desc("environment steps")
+                .x_labels(5)
+                .x_label_formatter(&|x| thousands(*x))
+                .y_label_formatter(&|y| if which == 1 { format!("{:.0} %", 100.0 * y) } else { format!("{y:.1}") })
+                .label_style((FONT, 14))
+                .draw()?;
+            chart.draw_series(DashedLineSeries::new([(first, mark), (last, mark)], 7, 5, GREY.stroke_width(1)))?;
+            for (color, horizon, bands) in &lines {
+                let (color, (x, y)) = (*color, &bands[which]);
+                let label = format!("{horizon} step{} ahead", if *horizon == 1 { "" } else { "s" });
+                chart
+                    .draw_series(LineSeries::new(x.iter().zip(y).map(|(x, [_, mean, _])| (*x, *mean)), color.stroke_width(3)))?
+                    .label(label)
+                    .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(3)));
+            }
+            let position = if which == 0 { SeriesLabelPosition::UpperRight } else { SeriesLabelPosition::LowerRight };
+            chart
+                .configure_series_labels()
+                .position(position)
+                .background_style(WHITE.mix(0.85))
+                .border_style(GREY.mix(0.4))
+                .label_font((FONT, 14))
+                .margin(8)
+                .draw()?;
+        }
+        Ok(())
+    })?;
+    Ok(true)
+}
+
 /// The methods of a task, each with its colour, the same in every figure.
 fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
     let of_task = tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task).map(|(_, method)| method);

@@ -19,9 +19,11 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     let mut tasks: Vec<&str> = pairs.iter().map(|(task, _)| task.as_str()).collect();
     tasks.dedup();
     let mut text = String::from("# Comparison\n\n");
-    text += "Every number here comes from `tests.csv`, `evaluations.csv` and `summary.csv` beside this page. ";
+    text += "Every number here comes from `tests.csv`, `evaluations.csv`, `models.csv` and `summary.csv` beside this page. ";
     text += "All methods are judged alike: the same tasks, observations and starts, deterministic actions, every ";
-    text += "environment step counted, the random warm-up too.\n\n";
+    text += "environment step counted, the random warm-up too. ";
+    text += "Not alike is what they are told: `oracle` plans on the true simulator, `pets` in a learned model but with the ";
+    text += "known reward as a function of what is observed; `sac` has only the rewards that it receives.\n\n";
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(
@@ -40,6 +42,13 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         write!(text, "\n![Success of each method on {task} over environment steps]({curves})\n").expect("text grows");
         write!(text, "\n![Success and smoothness of each method on {task} in the test]({tests})\n")
             .expect("text grows");
+        for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
+            let file = format!("{task}-{method}-model.svg");
+            if figures::model(&tables, task, method, &to.join(&file))? {
+                write!(text, "\n![Error and calibration of the model of {method} on {task} over environment steps]({file})\n")
+                    .expect("text grows");
+            }
+        }
     }
     text += "\n## How sure is this?\n\n";
     text += &caveat(&tables, &pairs)?;

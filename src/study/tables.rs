@@ -1,5 +1,5 @@
-//! From the folders of runs to the tables of a study: `evaluations.csv` and `tests.csv` hold every
-//! run's numbers, `summary.csv` one row for each task and method. Figures and report are made from these three
+//! From the folders of runs to the tables of a study: `evaluations.csv`, `models.csv` and `tests.csv` hold every
+//! run's numbers, `summary.csv` one row for each task and method. Figures and report are made from these
 //! files alone.
 
 use std::path::Path;
@@ -20,6 +20,8 @@ pub const LEVEL: f64 = 0.8;
 pub struct Tables {
     /// task, method, seed, step, success, ...: every evaluation of every learning run.
     pub evaluations: DataFrame,
+    /// task, method, seed, step, horizon, rmse, ...: how well every learned model foresaw each evaluation.
+    pub models: DataFrame,
     /// task, method, seed, episode, return, success, ...: every test episode.
     pub tests: DataFrame,
     /// One row for each task and method.
@@ -32,7 +34,7 @@ impl Tables {
     /// # Errors
     /// If a run's files are missing or damaged.
     pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
-        let (mut evaluations, mut tests) = (Vec::new(), Vec::new());
+        let (mut evaluations, mut models, mut tests) = (Vec::new(), Vec::new(), Vec::new());
         for folder in folders {
             let config = RunConfig::read(&folder.join("config.toml"))?;
             let labelled = |file: &str| -> Result<LazyFrame> {
@@ -48,15 +50,19 @@ impl Tables {
             if config.learns() {
                 evaluations.push(labelled("evaluations.csv")?);
             }
+            if folder.join("model.csv").exists() {
+                models.push(labelled("model.csv")?);
+            }
         }
         let join = |frames: Vec<LazyFrame>| {
             let options = UnionArgs { to_supertypes: true, ..UnionArgs::default() };
             if frames.is_empty() { Ok(DataFrame::empty()) } else { concat(frames, options)?.collect() }
         };
         let evaluations = join(evaluations).map_err(inside)?;
+        let models = join(models).map_err(inside)?;
         let tests = join(tests).map_err(inside)?;
         let summary = summarise(&evaluations, &tests).map_err(inside)?;
-        Ok(Self { evaluations, tests, summary })
+        Ok(Self { evaluations, models, tests, summary })
     }
 
     /// Reads the tables of a study from its folder.
@@ -66,6 +72,7 @@ impl Tables {
     pub fn read(folder: &Path) -> Result<Self> {
         Ok(Self {
             evaluations: read(&folder.join("evaluations.csv"))?,
+            models: read(&folder.join("models.csv"))?,
             tests: read(&folder.join("tests.csv"))?,
             summary: read(&folder.join("summary.csv"))?,
         })
@@ -76,8 +83,12 @@ impl Tables {
     /// # Errors
     /// If a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
-        let tables =
-            [("evaluations.csv", &self.evaluations), ("tests.csv", &self.tests), ("summary.csv", &self.summary)];
+        let tables = [
+            ("evaluations.csv", &self.evaluations),
+            ("models.csv", &self.models),
+            ("tests.csv", &self.tests),
+            ("summary.csv", &self.summary),
+        ];
         for (name, table) in tables {
             let mut bytes = Vec::new();
             if table.width() > 0 {
@@ -99,7 +110,29 @@ impl Tables {
     /// # Errors
     /// If the table lacks a column.
     pub fn curves(&self, task: &str, method: &str) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
-        curves(&self.evaluations, task, method).map_err(inside)
+        curves(&self.evaluations, task, method, "success").map_err(inside)
+    }
+
+    /// A number of `models.csv` over steps, for one horizon: for each seed, steps and values. Empty for methods without
+    /// a model.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn model_curves(
+        &self,
+        task: &str,
+        method: &str,
+        horizon: u32,
+        column: &str,
+    ) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
+        let found = || {
+            if self.models.width() == 0 {
+                return Ok(Vec::new());
+            }
+            let rows = self.models.clone().lazy().filter(col("horizon").eq(lit(horizon))).collect()?;
+            curves(&rows, task, method, column)
+        };
+        found().map_err(inside)
     }
 
     /// A number of the summary, if it has one there.
@@ -130,7 +163,7 @@ fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFra
         let [low, high] = wilson(successes.iter().filter(|s| **s > 0.5).count(), successes.len());
         let by_seed = by_seed(&rows, &successes)?;
         let bound = bootstrap(&by_seed, interquartile_mean, &mut rng::stream(0, "bootstrap"));
-        let curves = curves(evaluations, task, method)?;
+        let curves = curves(evaluations, task, method, "success")?;
         let reached: Vec<f64> = curves.iter().filter_map(|(x, y)| steps_to(LEVEL, x, y)).collect();
         let areas: Vec<f64> = curves.iter().map(|(x, y)| area_under_curve(x, y)).collect();
         let budget = curves
@@ -211,21 +244,22 @@ fn by_seed(rows: &DataFrame, successes: &[f64]) -> PolarsResult<Vec<f64>> {
     Ok(distinct.iter().map(of).collect())
 }
 
-fn curves(evaluations: &DataFrame, task: &str, method: &str) -> PolarsResult<Vec<(Vec<f64>, Vec<f64>)>> {
-    let rows = of(evaluations, task, method)?;
+/// A column over steps, for each seed.
+fn curves(frame: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<(Vec<f64>, Vec<f64>)>> {
+    let rows = of(frame, task, method)?;
     if rows.height() == 0 {
         return Ok(Vec::new());
     }
     let column = |name: &str| -> PolarsResult<Vec<f64>> { Ok(numbers(&rows, name)?.into_iter().flatten().collect()) };
-    let (seeds, steps, success) = (column("seed")?, column("step")?, column("success")?);
+    let (seeds, steps, values) = (column("seed")?, column("step")?, column(value)?);
     let mut curves: Vec<(f64, Vec<f64>, Vec<f64>)> = Vec::new();
-    for ((seed, step), success) in seeds.into_iter().zip(steps).zip(success) {
+    for ((seed, step), value) in seeds.into_iter().zip(steps).zip(values) {
         if curves.last().is_none_or(|(last, ..)| *last != seed) {
             curves.push((seed, Vec::new(), Vec::new()));
         }
         let (_, x, y) = curves.last_mut().expect("one was just added");
         x.push(step);
-        y.push(success);
+        y.push(value);
     }
     Ok(curves.into_iter().map(|(_, x, y)| (x, y)).collect())
 }
