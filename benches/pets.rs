@@ -72,9 +72,12 @@ fn plans(c: &mut Criterion) {
         let obs = vec![0.5; 24];
         // 350 x 5 candidates, 15 steps, 20 particles, 95,200 products each: the network's share of an action.
         group.throughput(Throughput::Elements(2 * 350 * 5 * 15 * 20 * (28 * 200 + 2 * 200 * 200 + 200 * 48)));
-        group.bench_function(BenchmarkId::new("one CEM action (throughput: FLOP of products)", format!("{propagation:?}")), |b| {
-            b.iter(|| black_box(agent.act(&obs, Mode::Evaluate)));
-        });
+        group.bench_function(
+            BenchmarkId::new("one CEM action (throughput: FLOP of products)", format!("{propagation:?}")),
+            |b| {
+                b.iter(|| black_box(agent.act(&obs, Mode::Evaluate)));
+            },
+        );
     }
     group.throughput(Throughput::Elements(1));
     for task in [Task::Reach, Task::Push, Task::Lift, Task::Pendulum] {
@@ -124,7 +127,8 @@ fn products(c: &mut Criterion) {
         group.bench_function(format!("{rows} x {inner} x {columns}, {threads} cores, FLOP"), |bench| {
             bench.iter(|| {
                 outs.par_iter_mut().for_each(|out| {
-                    (0..50).for_each(|_| matmul(black_box(out), Matrix::new(&a, inner), Matrix::new(&b, columns), false));
+                    (0..50)
+                        .for_each(|_| matmul(black_box(out), Matrix::new(&a, inner), Matrix::new(&b, columns), false));
                 });
             });
         });

@@ -78,7 +78,9 @@ pub mod watch;
 
 /// What most programs that use this crate need.
 pub mod prelude {
-    pub use crate::agent::{Agent, Losses, Mode, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted, Seat};
+    pub use crate::agent::{
+        Agent, Losses, Mode, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted, Seat,
+    };
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};

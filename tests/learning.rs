@@ -146,8 +146,15 @@ fn small_pets(seed: u64) -> RunConfig {
     (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
     let pets = config.pets.as_mut().expect("PETS's settings");
     pets.warm_up = 200;
-    pets.ensemble = EnsembleConfig { hidden: vec![16], first_steps: 50, steps: 20, check_every: 10, ..pets.ensemble.clone() };
-    pets.planner = PlannerConfig::Icem(IcemConfig { horizon: 4, population: 10, elites: 4, iterations: 2, ..IcemConfig::default() });
+    pets.ensemble =
+        EnsembleConfig { hidden: vec![16], first_steps: 50, steps: 20, check_every: 10, ..pets.ensemble.clone() };
+    pets.planner = PlannerConfig::Icem(IcemConfig {
+        horizon: 4,
+        population: 10,
+        elites: 4,
+        iterations: 2,
+        ..IcemConfig::default()
+    });
     config
 }
 

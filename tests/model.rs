@@ -86,8 +86,8 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
             let action = rng::uniform(&mut rng, -1.0, 1.0) as f32;
             let said = dynamics.predict(&obs, &[action]);
             let law = expected(&obs, action);
-            for i in 0..3 {
-                assert!((said.mean[i] - f64::from(law[i])).abs() < 0.02, "number {i}: {} for {}", said.mean[i], law[i]);
+            for (i, (said, law)) in said.mean.iter().zip(law).enumerate() {
+                assert!((said - f64::from(law)).abs() < 0.02, "number {i}: {said} for {law}");
             }
             let deviation = said.aleatoric[0].sqrt();
             assert!((0.5 * CHANCE..2.0 * CHANCE).contains(&deviation), "chance is {CHANCE}, not {deviation}");

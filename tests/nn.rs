@@ -89,7 +89,9 @@ fn a_layer_does_not_depend_on_the_number_of_threads() {
 #[test]
 fn gradients_of_a_dense_layer() {
     let mut rng = rng::stream(1, "dense");
-    for (x_members, activation) in [(1, Activation::Identity), (3, Activation::Identity), (3, Activation::Relu), (3, Activation::Silu)] {
+    for (x_members, activation) in
+        [(1, Activation::Identity), (3, Activation::Identity), (3, Activation::Relu), (3, Activation::Silu)]
+    {
         let inputs =
             vec![random((x_members, 7, 5), &mut rng), random((3, 5, 4), &mut rng), random((3, 1, 4), &mut rng)];
         let weights = random((3, 7, 4), &mut rng);

@@ -1,8 +1,8 @@
 //! Every planner finds known optima, and none needs to know what it plans for.
 
 use handful::plan::{
-    CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig, Objective, Plan, PlannerConfig,
-    RecedingHorizon, Sequences, ShootingConfig,
+    CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig, Objective, Plan,
+    PlannerConfig, RecedingHorizon, Sequences, ShootingConfig,
 };
 use handful::rng;
 
@@ -59,7 +59,10 @@ fn a_receding_horizon_plans_only_when_it_is_time() {
     for step in 0..13 {
         let mut objective = |c: &Sequences| {
             plans += 1;
-            assert!(c.horizon == 2 * HORIZON && c.rows().all(|row| row[..2] == row[2..4]), "actions are held for two steps");
+            assert!(
+                c.horizon == 2 * HORIZON && c.rows().all(|row| row[..2] == row[2..4]),
+                "actions are held for two steps"
+            );
             bowl(c, &target)
         };
         let action = control.act(&mut objective, &mut |_| {}, &mut rng);

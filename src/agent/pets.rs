@@ -12,10 +12,14 @@ use crate::env::{KnownReward, Spec};
 use crate::error::{Error, Result};
 use crate::model::open_loop::{OpenLoop, Trace, open_loop};
 use crate::model::uncertainty::Risk;
-use crate::model::{Differentiable, Dynamics, Ensemble, EnsembleConfig, Futures, Imagination, Propagation, Reward};
+use crate::model::{
+    Differentiable, Dynamics, Ensemble, EnsembleConfig, Futures, Imagination, Propagation, Reward, Value,
+};
 use crate::nn::Weights;
 use crate::plan::noise::ColoredNoise;
-use crate::plan::{ControlConfig, IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences};
+use crate::plan::{
+    ControlConfig, IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences,
+};
 use crate::replay::{ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
 
@@ -32,6 +36,9 @@ pub struct PetsConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
+    /// Steps that the last state of a plan is taken to last: its reward counts so many times more. Lets a short plan
+    /// prefer to end well.
+    pub tail: f32,
     /// How uncertainty is carried along imagined futures.
     pub propagation: Propagation,
     /// Imagined futures of each candidate: a multiple of the ensemble's elites.
@@ -58,6 +65,7 @@ impl Default for PetsConfig {
             ensemble: EnsembleConfig::default(),
             planner: PlannerConfig::Icem(IcemConfig::default()),
             control: ControlConfig::default(),
+            tail: 0.0,
             propagation: Propagation::TsInf,
             particles: 5,
             risk: Risk::Neutral,
@@ -118,12 +126,7 @@ impl Pets {
     ///
     /// # Errors
     /// If a setting cannot be used.
-    pub fn new(
-        spec: &Spec,
-        reward: Arc<dyn KnownReward + Send + Sync>,
-        config: PetsConfig,
-        seed: u64,
-    ) -> Result<Self> {
+    pub fn new(spec: &Spec, reward: Arc<dyn KnownReward + Send + Sync>, config: PetsConfig, seed: u64) -> Result<Self> {
         config.check()?;
         let mut rng = rng::stream(seed, "pets");
         Ok(Self {
@@ -238,16 +241,25 @@ struct View<'a> {
     config: &'a PetsConfig,
     dynamics: &'a Dynamics,
     reward: &'a (dyn KnownReward + Send + Sync),
+    /// What the last state of a plan is worth.
+    tail: Option<Box<Value<'a>>>,
 }
 
 impl<'a> View<'a> {
-    fn imagination(&self) -> Imagination<'a> {
+    fn new(config: &'a PetsConfig, dynamics: &'a Dynamics, reward: &'a (dyn KnownReward + Send + Sync)) -> Self {
+        let rest = vec![0.0; dynamics.action_size()];
+        let lasting = move |state: &[f32]| config.tail * reward.reward(state, &rest, state);
+        let tail = (config.tail > 0.0 && !config.ensemble.learn_reward).then(|| Box::new(lasting) as Box<_>);
+        Self { config, dynamics, reward, tail }
+    }
+
+    fn imagination(&self) -> Imagination<'_> {
         Imagination {
             dynamics: self.dynamics,
             reward: if self.config.ensemble.learn_reward { Reward::Learned } else { Reward::Known(self.reward) },
             propagation: self.config.propagation,
             particles: self.config.particles,
-            value: None,
+            value: self.tail.as_deref(),
         }
     }
 
@@ -280,7 +292,7 @@ impl<'a> View<'a> {
 impl Agent for Pets {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         let Some(dynamics) = &self.dynamics else { return self.explore() };
-        let view = View { config: &self.config, dynamics, reward: self.reward.as_ref() };
+        let view = View::new(&self.config, dynamics, self.reward.as_ref());
         let curiosity = if mode == Mode::Explore { self.config.curiosity } else { 0.0 };
         self.pilot.act(&view, obs, curiosity, &mut |_| {})
     }
@@ -288,17 +300,19 @@ impl Agent for Pets {
     fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
         self.prepare(seats);
         let Some(dynamics) = &self.dynamics else { return vec![vec![0.0; self.spec.action_size]; seats.len()] };
-        let view = View { config: &self.config, dynamics, reward: self.reward.as_ref() };
+        let view = View::new(&self.config, dynamics, self.reward.as_ref());
         let mut pilots: Vec<Option<&mut Pilot>> = self.seats.iter_mut().map(Some).collect();
-        let busy: Vec<(&Seat, &mut Pilot)> =
-            seats.iter().map(|seat| (seat, pilots[seat.number].take().expect("seats have different numbers"))).collect();
+        let busy: Vec<(&Seat, &mut Pilot)> = seats
+            .iter()
+            .map(|seat| (seat, pilots[seat.number].take().expect("seats have different numbers")))
+            .collect();
         busy.into_par_iter().map(|(seat, pilot)| pilot.act(&view, seat.obs, 0.0, &mut |_| {})).collect()
     }
 
     fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
         self.prepare(&[*seat]);
         let Some(dynamics) = &self.dynamics else { return (vec![0.0; self.spec.action_size], Vec::new()) };
-        let view = View { config: &self.config, dynamics, reward: self.reward.as_ref() };
+        let view = View::new(&self.config, dynamics, self.reward.as_ref());
         // The plan, and of each iteration a few that were tried, from the best to the worst.
         let mut shown: Option<Sequences> = None;
         let mut observer = |iteration: &Iteration| {

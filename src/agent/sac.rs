@@ -17,8 +17,8 @@ use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::ops;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, SquashedGaussian, Tensor3, Weights, copy_parameters, device, polyak,
-    tensor, values,
+    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, SquashedGaussian, Tensor3, Weights, copy_parameters,
+    device, polyak, tensor, values,
 };
 use crate::replay::{Batch, ReplayBuffer, Transition};
 use crate::rng::{self, Rng};

@@ -173,7 +173,8 @@ fn known_reward<T: Tape<f32, Cpu>>(
     let (next, mut tape) = next.split_tape();
     let &(members, candidates, width) = obs.shape();
     let act = action.shape().2;
-    let rows = || values(obs).chunks_exact(width).zip(values(action).chunks_exact(act)).zip(values(&next).chunks_exact(width));
+    let rows =
+        || values(obs).chunks_exact(width).zip(values(action).chunks_exact(act)).zip(values(&next).chunks_exact(width));
     let rewards = rows().map(|((obs, action), next)| known.reward(obs, action, next)).collect();
     // How the reward changes with each number that it is computed from, side by side.
     let slopes: Vec<f32> = if T::OWNS_TAPE {

@@ -2,8 +2,8 @@
 
 use dfdx::tensor::Cpu;
 
-use super::{Layout, Normaliser};
 use super::uncertainty::split;
+use super::{Layout, Normaliser};
 use crate::nn::kernels::{self, Matrix, vectorised_fn};
 use crate::nn::{Activation, Mlp, bounded};
 

@@ -19,8 +19,8 @@ use super::{Dynamics, Layout, Normaliser};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Parameters, Tensor3, Weights, bounded_nll,
-    device, tensor, values,
+    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Parameters, Tensor3, Weights,
+    bounded_nll, device, tensor, values,
 };
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
@@ -108,7 +108,9 @@ impl EnsembleConfig {
             return Err(Error::BadSetting("ensemble: `elites` must lie between 1 and `members`".into()));
         }
         if self.hidden.is_empty() || self.hidden.contains(&0) {
-            return Err(Error::BadSetting("ensemble: `hidden` must name at least one layer, each at least 1 wide".into()));
+            return Err(Error::BadSetting(
+                "ensemble: `hidden` must name at least one layer, each at least 1 wide".into(),
+            ));
         }
         if !(0.0..0.9).contains(&self.held_out) {
             return Err(Error::BadSetting("ensemble: `held_out` must lie in [0, 0.9)".into()));
@@ -306,7 +308,8 @@ impl Ensemble {
         per_member
             .map(|head| {
                 let pairs = head.chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs));
-                let squares = pairs.flat_map(|(head, target)| head.iter().zip(target).map(|(m, t)| f64::from(m - t).powi(2)));
+                let squares =
+                    pairs.flat_map(|(head, target)| head.iter().zip(target).map(|(m, t)| f64::from(m - t).powi(2)));
                 squares.sum::<f64>() / targets.len() as f64
             })
             .collect()

@@ -43,6 +43,9 @@ pub enum Reward<'a> {
     Learned,
 }
 
+/// What an observed state is worth.
+pub type Value<'a> = dyn Fn(&[f32]) -> f32 + Sync + 'a;
+
 /// Runs a model ahead.
 #[derive(Clone, Copy)]
 pub struct Imagination<'a> {
@@ -56,7 +59,7 @@ pub struct Imagination<'a> {
     /// them, and one in all where only the mean of means is followed.)
     pub particles: usize,
     /// What the state at the horizon's end is worth beyond it, if anything is known of that.
-    pub value: Option<&'a (dyn Fn(&[f32]) -> f32 + Sync)>,
+    pub value: Option<&'a Value<'a>>,
 }
 
 /// What may become of candidates.
@@ -182,7 +185,9 @@ impl Imagination<'_> {
                 if *alive {
                     returns[row % candidates * particles + row / candidates] += reward;
                     if let Reward::Known(known) = self.reward {
-                        *alive = !known.terminated(&next[row * self.dynamics.observation_size()..][..self.dynamics.observation_size()]);
+                        *alive = !known.terminated(
+                            &next[row * self.dynamics.observation_size()..][..self.dynamics.observation_size()],
+                        );
                     }
                 }
             }
@@ -476,7 +481,8 @@ mod tests {
         let four = |_: &[f32]| 100.0;
         let mut imagination = imagine(&dynamics, Propagation::TsInf, 2);
         imagination.value = Some(&four);
-        let futures = imagination.futures(&[0.0], &[vec![1.0; 8], vec![0.5; 8]].concat(), 8, &mut rng::stream(2, "end"));
+        let futures =
+            imagination.futures(&[0.0], &[vec![1.0; 8], vec![0.5; 8]].concat(), 8, &mut rng::stream(2, "end"));
         let near = |found: f32, expected: f32| assert!((found - expected).abs() < 1e-3, "{found}, expected {expected}");
         near(futures.returns[0], 15.0);
         near(futures.returns[2], 18.0 + 100.0);
@@ -487,13 +493,9 @@ mod tests {
     fn futures_depend_on_the_seed_alone() {
         let dynamics = disputed(0.3, 0.2);
         let actions: Vec<f32> = (0..300).map(|i| (i as f32 * 0.7).sin()).collect();
-        for propagation in [
-            Propagation::TsInf,
-            Propagation::Ts1,
-            Propagation::Members,
-            Propagation::Mean,
-            Propagation::MomentMatching,
-        ] {
+        for propagation in
+            [Propagation::TsInf, Propagation::Ts1, Propagation::Members, Propagation::Mean, Propagation::MomentMatching]
+        {
             let run = |threads: usize, actions: &[f32]| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
                 let imagination = imagine(&dynamics, propagation, 4);

@@ -29,7 +29,8 @@ impl Layout {
         let (mut inputs, mut predicted, mut differences) = (Vec::new(), Vec::new(), Vec::new());
         let find = |name: &str| {
             let known = features.iter().position(|f| f.name == name && !matches!(f.role, Role::Difference { .. }));
-            known.ok_or_else(|| Error::BadSetting(format!("{}: no feature `{name}` to take a difference of", spec.name)))
+            known
+                .ok_or_else(|| Error::BadSetting(format!("{}: no feature `{name}` to take a difference of", spec.name)))
         };
         for (i, feature) in features.iter().enumerate() {
             match &feature.role {

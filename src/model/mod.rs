@@ -16,6 +16,6 @@ pub mod uncertainty;
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit};
-pub use imagination::{Futures, Imagination, Propagation, Reward};
+pub use imagination::{Futures, Imagination, Propagation, Reward, Value};
 pub use layout::Layout;
 pub use normaliser::Normaliser;

@@ -53,7 +53,8 @@ impl Adam {
     pub fn step(&mut self, module: &mut impl Parameters, gradients: &mut Gradients<f32, Cpu>) -> f32 {
         // Every parameter with its gradient and its moments: a piece of work of its own.
         let work = module.parameters_mut().into_iter().map(|(name, parameter)| {
-            let gradient = std::mem::take(&mut **gradients.get_or_alloc_mut(&*parameter).expect("memory for a gradient"));
+            let gradient =
+                std::mem::take(&mut **gradients.get_or_alloc_mut(&*parameter).expect("memory for a gradient"));
             let zeros = || [vec![0.0; gradient.len()], vec![0.0; gradient.len()]];
             let moments = self.moments.remove(&name).unwrap_or_else(zeros);
             (name, parameter, gradient, moments)
@@ -65,7 +66,8 @@ impl Adam {
         self.steps += 1;
         let rule = Rule::new(&self.config, self.steps, clip);
         work.par_iter_mut().for_each(|(name, parameter, gradient, [first, second])| {
-            let decay = if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
+            let decay =
+                if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
             let mut updated = values(parameter).to_vec();
             update(&mut updated, gradient, first, second, Rule { decay, ..rule });
             parameter.copy_from(&updated);

@@ -3,9 +3,9 @@
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
-use super::ops::{Learning, Tensor3, take, values};
-use super::kernels::{self, vectorised_fn};
 use super::Parameters;
+use super::kernels::{self, vectorised_fn};
+use super::ops::{Learning, Tensor3, take, values};
 
 /// Weight of the penalty that draws learned bounds together.
 const BOUND_PENALTY: f32 = 0.01;
@@ -177,7 +177,13 @@ mod tests {
         near(
             gradients.get_or_alloc_mut(&head).unwrap(),
             &[
-                0.166_215_53, -0.202_089_97, 0.197_569_12, 0.120_783_72, -2.753_333_39, 0.292_310_10, 0.110_821_38,
+                0.166_215_53,
+                -0.202_089_97,
+                0.197_569_12,
+                0.120_783_72,
+                -2.753_333_39,
+                0.292_310_10,
+                0.110_821_38,
                 0.061_274_77,
             ],
         );

@@ -31,7 +31,8 @@ impl ControlConfig {
         planner.check()?;
         if self.hold == 0 || self.replan_every == 0 || self.replan_every > planner.horizon() {
             return Err(Error::BadSetting(
-                "control: `hold` and `replan_every` must be at least 1, and `replan_every` no longer than the horizon".into(),
+                "control: `hold` and `replan_every` must be at least 1, and `replan_every` no longer than the horizon"
+                    .into(),
             ));
         }
         Ok(())

@@ -36,8 +36,7 @@ impl Hybrid {
     /// For actions of so many numbers.
     pub fn new(config: HybridConfig, actions: usize) -> Self {
         let HybridConfig { icem, iterations, rate } = config;
-        let ascent =
-            GradientConfig { horizon: icem.horizon, starts: 1, iterations, rate, ..GradientConfig::default() };
+        let ascent = GradientConfig { horizon: icem.horizon, starts: 1, iterations, rate, ..GradientConfig::default() };
         Self { icem: Icem::new(icem, actions), ascent, actions }
     }
 }

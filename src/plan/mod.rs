@@ -190,7 +190,9 @@ impl PlannerConfig {
             return Err(Error::BadSetting("planner: `horizon` must be at least 2".into()));
         }
         if tried == 0 {
-            return Err(Error::BadSetting("planner: population, elites, iterations, starts: at least 1 of each".into()));
+            return Err(Error::BadSetting(
+                "planner: population, elites, iterations, starts: at least 1 of each".into(),
+            ));
         }
         Ok(())
     }

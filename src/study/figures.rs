@@ -184,7 +184,10 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
         let title = format!("{task}: what the model of {method} foresees in episodes that it has not learned from");
         let area = area.margin(14, 10, 10, 10).titled(&title, (FONT, 20))?;
         let panels = area.split_evenly((1, 2));
-        let about = [("error (1: as good as foreseeing no change)", worst.min(4.0), 1.0), ("truth inside the 90 % interval", 1.03, 0.9)];
+        let about = [
+            ("error (1: as good as foreseeing no change)", worst.min(4.0), 1.0),
+            ("truth inside the 90 % interval", 1.03, 0.9),
+        ];
         for (which, (panel, (title, top, mark))) in panels.iter().zip(about).enumerate() {
             let mut chart = ChartBuilder::on(panel)
                 .caption(title, (FONT, 15))
@@ -208,7 +211,10 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
                 let (color, (x, y)) = (*color, &bands[which]);
                 let label = format!("{horizon} step{} ahead", if *horizon == 1 { "" } else { "s" });
                 chart
-                    .draw_series(LineSeries::new(x.iter().zip(y).map(|(x, [_, mean, _])| (*x, *mean)), color.stroke_width(3)))?
+                    .draw_series(LineSeries::new(
+                        x.iter().zip(y).map(|(x, [_, mean, _])| (*x, *mean)),
+                        color.stroke_width(3),
+                    ))?
                     .label(label)
                     .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(3)));
             }

@@ -45,8 +45,11 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
             let file = format!("{task}-{method}-model.svg");
             if figures::model(&tables, task, method, &to.join(&file))? {
-                write!(text, "\n![Error and calibration of the model of {method} on {task} over environment steps]({file})\n")
-                    .expect("text grows");
+                write!(
+                    text,
+                    "\n![Error and calibration of the model of {method} on {task} over environment steps]({file})\n"
+                )
+                .expect("text grows");
             }
         }
     }

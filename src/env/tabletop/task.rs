@@ -91,10 +91,12 @@ pub(super) fn xyz(name: &str, centre: [f32; 3], scale: f32) -> impl Iterator<Ite
 
 /// Features for the way from one place to another, each named in the three coordinates of its position.
 pub(super) fn way(from: &str, to: &str) -> impl Iterator<Item = Feature> + use<> {
-    ["x", "y", "z"].map(|axis| {
-        let feature = Feature::new(format!("{from} to {to} {axis}")).around(0.0, 0.1);
-        feature.difference(format!("{to} {axis}"), format!("{from} {axis}"))
-    }).into_iter()
+    ["x", "y", "z"]
+        .map(|axis| {
+            let feature = Feature::new(format!("{from} to {to} {axis}")).around(0.0, 0.1);
+            feature.difference(format!("{to} {axis}"), format!("{from} {axis}"))
+        })
+        .into_iter()
 }
 
 /// Features of an object: position, the directions of its x and z axes (continuous, where a
