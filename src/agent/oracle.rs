@@ -25,11 +25,13 @@ pub struct OracleConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
+    /// Steps that the last state of a plan is taken to last: its reward counts so many times more.
+    pub tail: f32,
 }
 
 impl Default for OracleConfig {
     fn default() -> Self {
-        Self { planner: PlannerConfig::Icem(IcemConfig::default()), control: ControlConfig::default() }
+        Self { planner: PlannerConfig::Icem(IcemConfig::default()), control: ControlConfig::default(), tail: 0.0 }
     }
 }
 
@@ -63,29 +65,33 @@ impl Oracle {
             controller.reset();
         }
         let state = seat.world.snapshot();
-        let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates);
+        let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates, config.tail);
         controller.act(&mut objective, &mut |_| {}, rng)
     }
 }
 
 /// The return of each sequence, tried out from `state`, the work shared out over the worlds.
-fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences) -> Vec<f32> {
+fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences, tail: f32) -> Vec<f32> {
     let share = candidates.count().div_ceil(worlds.len());
     let mut returns = vec![0.0; candidates.count()];
     let shares = returns.par_chunks_mut(share).zip(worlds).enumerate();
     shares.for_each(|(part, (returns, world))| {
         for (i, total) in returns.iter_mut().enumerate() {
             world.restore(state);
+            let mut last = 0.0;
             for action in candidates.row(part * share + i).chunks(candidates.actions) {
                 let Ok(step) = world.step(action) else {
                     *total = f32::NAN;
                     break;
                 };
                 *total += step.reward;
+                last = step.reward;
                 if step.terminated {
+                    last = 0.0;
                     break;
                 }
             }
+            *total += tail * last;
         }
     });
     returns

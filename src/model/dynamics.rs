@@ -42,8 +42,9 @@ pub struct Prediction {
 /// Buffers of a forward pass, to be used again.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    /// Inputs, and every second layer's outputs.
-    pub(super) x: Vec<f32>,
+    /// What goes into a layer.
+    x: Vec<f32>,
+    /// What comes out.
     y: Vec<f32>,
 }
 
@@ -102,10 +103,7 @@ impl Dynamics {
         let outputs = self.outputs();
         let mut scratch = Scratch::default();
         let opinion = |member: usize| {
-            scratch.x.clear();
-            self.push_input(&mut scratch.x, obs, action);
-            let head = self.forward(member, &mut scratch);
-            self.to_physical(head);
+            let head = self.ask(member, 0..1, obs, action, &mut scratch);
             let (change, deviation) = head.split_at(outputs);
             // A reward is predicted as it is, an observation by its change.
             let before = self.layout.predicted.iter().map(|i| obs[*i]).chain(std::iter::repeat(0.0));
@@ -130,17 +128,28 @@ impl Dynamics {
         self.targets.mean.len()
     }
 
-    /// Adds a row of network input.
-    pub(super) fn push_input(&self, x: &mut Vec<f32>, obs: &[f32], action: &[f32]) {
-        let features = self.inputs.mean.iter().zip(&self.inputs.scale);
-        let read = self.layout.inputs.iter().map(|i| obs[*i]).chain(action.iter().copied());
-        x.extend(read.zip(features).map(|(x, (mean, scale))| (x - mean) / scale));
-    }
-
-    /// One member's answers for the rows in `scratch.x`, `[rows, 2 outputs]`: normalised mean, and raw log-variance.
-    pub(super) fn forward<'a>(&self, member: usize, scratch: &'a mut Scratch) -> &'a mut [f32] {
-        let layers = &self.members[member];
+    /// What one member says of the given rows of states and actions, `[rows, 2 outputs]`: changes, and then standard
+    /// deviations.
+    pub(super) fn ask<'a>(
+        &self,
+        member: usize,
+        rows: impl Iterator<Item = usize>,
+        states: &[f32],
+        actions: &[f32],
+        scratch: &'a mut Scratch,
+    ) -> &'a mut [f32] {
         let Scratch { x, y } = scratch;
+        x.clear();
+        for row in rows {
+            let (state, action) = (
+                &states[row * self.layout.width..][..self.layout.width],
+                &actions[row * self.actions..][..self.actions],
+            );
+            let read = self.layout.inputs.iter().map(|i| state[*i]).chain(action.iter().copied());
+            let features = self.inputs.mean.iter().zip(&self.inputs.scale);
+            x.extend(read.zip(features).map(|(x, (mean, scale))| (x - mean) / scale));
+        }
+        let layers = &self.members[member];
         for (i, Layer { weight, bias }) in layers.iter().enumerate() {
             let outputs = bias.len();
             let inputs = weight.len() / outputs;
@@ -150,18 +159,15 @@ impl Dynamics {
             kernels::add_and_activate(y, bias, activation);
             std::mem::swap(x, y);
         }
-        x
-    }
-
-    /// Rows of what [`Dynamics::forward`] answered, in place: normalised means become changes, raw log-variances become
-    /// standard deviations.
-    pub(super) fn to_physical(&self, head: &mut [f32]) {
+        let Normaliser { mean, scale } = &self.targets;
         let [max, min] = &self.bounds;
-        denormalise(head, &self.targets.mean, &self.targets.scale, max, min, &self.temperature);
+        denormalise(x, mean, scale, max, min, &self.temperature);
+        x
     }
 }
 
 vectorised_fn! {
+    /// Normalised means become changes, raw log-variances become standard deviations.
     fn denormalise(
         head: &'a mut [f32],
         mean: &'a [f32],

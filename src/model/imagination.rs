@@ -218,14 +218,9 @@ impl Imagination<'_> {
         let rewarded = self.dynamics.predicts_reward().then_some(predicted.len());
         let particles = luck.order.len();
         let candidates = rewards.len() / particles;
-        let act = self.dynamics.action_size();
         for (member, flock) in luck.order.chunks_exact(particles / self.dynamics.members()).enumerate() {
-            scratch.x.clear();
-            for row in flock.iter().flat_map(|p| p * candidates..(p + 1) * candidates) {
-                self.dynamics.push_input(&mut scratch.x, &states[row * width..][..width], &actions[row * act..][..act]);
-            }
-            let head = self.dynamics.forward(member, scratch);
-            self.dynamics.to_physical(head);
+            let rows = flock.iter().flat_map(|p| p * candidates..(p + 1) * candidates);
+            let head = self.dynamics.ask(member, rows, states, actions, scratch);
             for (&p, head) in flock.iter().zip(head.chunks_exact(candidates * 2 * outputs)) {
                 let noise = &luck.noise[p * outputs..][..outputs];
                 let rows = p * candidates * width..(p + 1) * candidates * width;
@@ -258,19 +253,14 @@ impl Imagination<'_> {
         scratch: &mut Scratch,
     ) {
         let (width, outputs) = (self.dynamics.observation_size(), self.dynamics.outputs());
-        let (act, members) = (self.dynamics.action_size(), self.dynamics.members());
+        let members = self.dynamics.members();
         let rows = rewards.len();
         let (candidates, particles) = (disagreement.len(), rows / disagreement.len());
         let share = 1.0 / members as f32;
         // Sums over members, of means, of their squares, and of variances.
         let [mut means, mut squares, mut variances] = [0; 3].map(|_| vec![0.0; rows * outputs]);
         for member in 0..members {
-            scratch.x.clear();
-            for row in 0..rows {
-                self.dynamics.push_input(&mut scratch.x, &states[row * width..][..width], &actions[row * act..][..act]);
-            }
-            let head = self.dynamics.forward(member, scratch);
-            self.dynamics.to_physical(head);
+            let head = self.dynamics.ask(member, 0..rows, states, actions, scratch);
             for (row, head) in head.chunks_exact(2 * outputs).enumerate() {
                 let (change, deviation) = head.split_at(outputs);
                 for i in 0..outputs {

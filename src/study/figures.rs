@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use plotters::coord::Shift;
+use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
@@ -88,14 +89,7 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
                 .label(format!("{method} (does not learn)"))
                 .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(2)));
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
-            .background_style(WHITE.mix(0.85))
-            .border_style(GREY.mix(0.4))
-            .label_font((FONT, 14))
-            .margin(8)
-            .draw()?;
+        legend(&mut chart, SeriesLabelPosition::LowerRight)?;
         Ok(())
     })
 }
@@ -219,18 +213,25 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
                     .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(3)));
             }
             let position = if which == 0 { SeriesLabelPosition::UpperRight } else { SeriesLabelPosition::LowerRight };
-            chart
-                .configure_series_labels()
-                .position(position)
-                .background_style(WHITE.mix(0.85))
-                .border_style(GREY.mix(0.4))
-                .label_font((FONT, 14))
-                .margin(8)
-                .draw()?;
+            legend(&mut chart, position)?;
         }
         Ok(())
     })?;
     Ok(true)
+}
+
+type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+
+fn legend<'a, 'b: 'a>(chart: &mut Chart<'a, 'b>, position: SeriesLabelPosition) -> Drawn {
+    chart
+        .configure_series_labels()
+        .position(position)
+        .background_style(WHITE.mix(0.85))
+        .border_style(GREY.mix(0.4))
+        .label_font((FONT, 14))
+        .margin(8)
+        .draw()?;
+    Ok(())
 }
 
 /// The methods of a task, each with its colour, the same in every figure.
