@@ -14,7 +14,7 @@ use crate::env::KnownReward;
 use crate::rng::{self, Rng};
 
 /// Rows that one thread puts through a network at a time: enough for a fast matrix product, few enough for its cache.
-const ROWS: usize = 96;
+const ROWS: usize = 192;
 
 /// How uncertainty is carried from step to step (Chua et al. 2018, section 5).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
