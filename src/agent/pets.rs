@@ -181,10 +181,9 @@ impl Pets {
     fn explore(&mut self) -> Vec<f32> {
         let size = self.spec.action_size;
         if self.random.is_empty() {
-            let length = self.spec.horizon.max(2);
-            let noise = ColoredNoise::new(self.config.warm_up_colour, length);
-            let columns: Vec<Vec<f64>> = (0..size).map(|_| noise.sample(&mut self.rng)).collect();
-            self.random = (0..length * size).map(|i| columns[i % size][i / size].clamp(-1.0, 1.0) as f32).collect();
+            let noise = ColoredNoise::new(self.config.warm_up_colour, self.spec.horizon.max(2));
+            let actions = noise.sample_actions(size, &mut self.rng);
+            self.random = actions.iter().map(|a| a.clamp(-1.0, 1.0) as f32).collect();
         }
         self.random.drain(..size).collect()
     }

@@ -255,11 +255,6 @@ impl Ensemble {
         )
     }
 
-    /// The networks themselves, for those who differentiate through them; with the members that predict.
-    pub fn networks(&self) -> (&Mlp, &[usize]) {
-        (&self.learner.networks, &self.elites)
-    }
-
     fn normalised(&mut self, data: &ReplayBuffer) -> Data {
         assert!(data.len() >= 2, "an ensemble learns from at least two transitions");
         let (mut inputs, mut targets) = (Vec::new(), Vec::new());

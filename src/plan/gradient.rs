@@ -62,9 +62,8 @@ impl Planner for Gradient {
         let mut sequences = Sequences::new(horizon, self.actions);
         sequences.values.extend(self.before.iter().map(|a| *a as f32));
         for _ in 1..starts {
-            let columns: Vec<Vec<f64>> = (0..self.actions).map(|_| self.noise.sample(rng)).collect();
-            let noise = (0..self.before.len()).map(|i| deviation * columns[i % self.actions][i / self.actions]);
-            sequences.values.extend(noise.map(|a| a.clamp(-1.0, 1.0) as f32));
+            let noise = self.noise.sample_actions(self.actions, rng);
+            sequences.values.extend(noise.iter().map(|noise| (deviation * noise).clamp(-1.0, 1.0) as f32));
         }
         let plan = ascend(sequences, &self.config, objective, observer);
         self.before = plan.actions.iter().map(|a| f64::from(*a)).collect();

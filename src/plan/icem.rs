@@ -84,9 +84,8 @@ impl Icem {
     }
 
     fn sample(&self, variance: &[f64], rng: &mut Rng) -> Vec<f32> {
-        let columns: Vec<Vec<f64>> = (0..self.actions).map(|_| self.noise.sample(rng)).collect();
-        let numbers = self.mean.iter().zip(variance).enumerate();
-        let noisy = numbers.map(|(i, (m, v))| m + v.sqrt() * columns[i % self.actions][i / self.actions]);
+        let noise = self.noise.sample_actions(self.actions, rng);
+        let noisy = self.mean.iter().zip(variance).zip(noise).map(|((m, v), noise)| m + v.sqrt() * noise);
         noisy.map(|a| a.clamp(-1.0, 1.0) as f32).collect()
     }
 }

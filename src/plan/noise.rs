@@ -56,6 +56,12 @@ impl ColoredNoise {
             })
             .collect()
     }
+
+    /// One sequence for each number of an action, side by side: `[length, actions]`.
+    pub fn sample_actions(&self, actions: usize, rng: &mut Rng) -> Vec<f64> {
+        let columns: Vec<Vec<f64>> = (0..actions).map(|_| self.sample(rng)).collect();
+        (0..self.length).flat_map(|t| columns.iter().map(move |column| column[t])).collect()
+    }
 }
 
 #[cfg(test)]
