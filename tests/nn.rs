@@ -4,8 +4,8 @@
 use dfdx::prelude::*;
 use handful::nn::kernels::{self, DenseShape, Matrix};
 use handful::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Parameters, SquashedGaussian, Tensor3, Weights,
-    copy_parameters, device, ops, polyak, tensor, values,
+    Activation, Adam, AdamConfig, BlockDense, Init, Learning, Mlp, MlpConfig, Norm, Parameters, SquashedGaussian,
+    SymexpBins, Tensor3, Weights, copy_parameters, device, norm, ops, polyak, recurrent, tensor, values,
 };
 use handful::rng::{self, Rng};
 
@@ -108,22 +108,135 @@ fn gradients_of_a_dense_layer() {
     }
 }
 
-#[test]
-fn gradients_of_layer_normalisation() {
-    let mut rng = rng::stream(2, "norm");
-    for activation in [Activation::Identity, Activation::Silu] {
-        let inputs = vec![random((2, 6, 9), &mut rng), random((2, 1, 9), &mut rng), random((2, 1, 9), &mut rng)];
-        let weights = random((2, 6, 9), &mut rng);
+/// The gradient of any operation on several tensors, of which the first carries the tape.
+macro_rules! check_operation {
+    ($inputs:expr, |$x:ident, $rest:pat_param| $operation:expr) => {{
+        let inputs: Vec<Tensor3> = $inputs;
+        let result = |$x: Tensor3, rest: &[Tensor3]| {
+            let $rest = rest else { unreachable!() };
+            $operation
+        };
+        let &shape = result(inputs[0].clone(), &inputs[1..]).shape();
+        let weights = random(shape, &mut rng::stream(99, "weights"));
         check_gradients(inputs, |inputs, taped| {
-            let [x, gain, shift] = inputs else { unreachable!() };
+            let $rest = &inputs[1..] else { unreachable!() };
             if taped {
-                let y = ops::layer_norm(x.clone().leaky_traced(), gain, shift, activation, Learning::Trained);
-                let loss = scalar(y, &weights);
+                let $x = inputs[0].clone().leaky_traced();
+                let loss = scalar($operation, &weights);
                 (loss.array(), Some(loss.backward()))
             } else {
-                (scalar(ops::layer_norm(x.clone(), gain, shift, activation, Learning::Trained), &weights).array(), None)
+                let $x = inputs[0].clone();
+                (scalar($operation, &weights).array(), None)
             }
         });
+    }};
+}
+
+#[test]
+fn gradients_of_normalisation() {
+    let mut rng = rng::stream(2, "norm");
+    // Nineteen features: one full vector and a rest.
+    let mut draw = |rows: usize| random((2, rows, 19), &mut rng);
+    for activation in [Activation::Identity, Activation::Silu] {
+        check_operation!(vec![draw(6), draw(1), draw(1)], |x, [gain, shift]| norm::layer_norm(
+            x,
+            gain,
+            shift,
+            activation,
+            Learning::Trained
+        ));
+        check_operation!(vec![draw(6), draw(1)], |x, [gain]| norm::rms_norm(x, gain, activation, Learning::Trained));
+    }
+}
+
+/// Numbers computed in float64 from the reference's formula.
+#[test]
+fn root_mean_square_normalisation_is_the_references() {
+    let x = tensor(&device(), vec![1.0, -2.0, 0.5, 3.0], (1, 1, 4));
+    let gain = tensor(&device(), vec![1.0; 4], (1, 1, 4));
+    for (activation, expected) in [
+        (Activation::Identity, [0.529_805_51, -1.059_611_01, 0.264_902_75, 1.589_416_52]),
+        (Activation::Silu, [0.333_479_59, -0.272_726_71, 0.149_892_87, 1.320_064_45]),
+    ] {
+        let y = norm::rms_norm(x.clone(), &gain, activation, Learning::Frozen);
+        values(&y).iter().zip(expected).for_each(|(y, expected)| near("normalised", *y, expected, 1e-6));
+    }
+}
+
+#[test]
+fn gradients_of_rows() {
+    let mut rng = rng::stream(10, "rows");
+    let mut draw = |rows: usize| random((1, rows, 3), &mut rng);
+    check_operation!(vec![draw(5)], |x, []| ops::rows(x, 1, 3));
+    check_operation!(vec![draw(4)], |x, []| ops::scale_rows(x, &[0.5, 0.0, -2.0, 1.0]));
+    check_operation!(vec![draw(4)], |x, []| ops::rowwise(x, |row, x, slope| {
+        let factor = 1.0 + row as f32;
+        slope.iter_mut().zip(x).for_each(|(slope, x)| *slope = 2.0 * factor * x);
+        factor * x.iter().map(|x| x * x).sum::<f32>()
+    }));
+    check_operation!(vec![draw(2), draw(3)], |x, [other]| {
+        let (x, tape) = x.split_tape();
+        ops::stack(tape, &[x, other.clone()])
+    });
+}
+
+#[test]
+fn a_total_is_a_weighted_sum_of_means() {
+    let (a, b) = (tensor(&device(), vec![1.0, 3.0], (1, 2, 1)), tensor(&device(), vec![5.0], (1, 1, 1)));
+    let total = ops::total(OwnedTape::default(), &[(2.0, a.clone()), (0.5, b.clone())]);
+    assert_eq!(total.array(), 6.5);
+    let mut gradients = total.backward();
+    assert_eq!(**gradients.get_or_alloc_mut(&a).expect("memory"), [1.0, 1.0]);
+    assert_eq!(**gradients.get_or_alloc_mut(&b).expect("memory"), [0.5]);
+}
+
+#[test]
+fn gradients_of_the_block_gru() {
+    let mut rng = rng::stream(11, "gru");
+    let (blocks, memory, beside) = (2, 6, 4);
+    let layer = BlockDense::new(&device(), blocks, memory, beside, 3 * memory, &mut rng);
+    let parameters: Vec<Tensor3> = layer.parameters().into_iter().map(|(_, p)| p.clone()).collect();
+    let inputs: Vec<Tensor3> = [random((1, 5, memory), &mut rng), random((1, 5, beside), &mut rng)]
+        .into_iter()
+        .chain(parameters.iter().map(|p| random(*p.shape(), &mut rng)))
+        .collect();
+    let with = |parameters: &[Tensor3]| {
+        let mut layer = layer.clone();
+        layer.parameters_mut().into_iter().zip(parameters).for_each(|((_, own), given)| *own = given.clone());
+        layer
+    };
+    check_operation!(inputs, |x, [beside, weight, bias, of_beside]| {
+        let (memory, tape) = x.split_tape();
+        let layer = with(&[weight.clone(), bias.clone(), of_beside.clone()]);
+        recurrent::gru(layer.forward(memory.clone().put_tape(tape), Some(beside)), &memory, blocks)
+    });
+}
+
+#[test]
+fn gradients_of_two_hot_losses() {
+    let bins = SymexpBins::new(15, 3.0);
+    let mut rng = rng::stream(12, "two-hot");
+    let (one, other) = ([0.3, -5.0, 40.0, 0.0], [1.0, 2.0, -3.0, 0.1]);
+    check_operation!(vec![random((1, 4, 15), &mut rng)], |x, []| bins.loss(x, &[&one, &other]));
+}
+
+/// Numbers computed in float64 from the reference's formulas: three steps of LaProp after adaptive clipping.
+#[test]
+fn laprop_steps_as_the_reference() {
+    let mut module = norm::RmsNorm::new(&device(), 3);
+    module.parameters_mut()[0].1.copy_from(&[0.5, -0.3, 0.2]);
+    let mut optimiser = Adam::new(AdamConfig { warm_up: 0, ..AdamConfig::laprop(0.01) });
+    let steps = [
+        ([1.0, -0.2, 0.05], [0.49, -0.29, 0.19]),
+        ([-0.3, 0.01, 0.02], [0.490_503_71, -0.286_476_93, 0.179_327_44]),
+        ([0.0, 0.1, -0.04], [0.490_821_55, -0.290_251_31, 0.178_574_43]),
+    ];
+    for (gradient, expected) in steps {
+        let mut gradients = dfdx::tensor::Gradients::leaky();
+        gradients.get_or_alloc_mut(module.parameters()[0].1).expect("memory").copy_from_slice(&gradient);
+        optimiser.step(&mut module, &mut gradients);
+        let found = values(module.parameters()[0].1).to_vec();
+        found.iter().zip(expected).for_each(|(w, expected)| near("weight", *w, expected, 1e-6));
     }
 }
 
@@ -207,13 +320,13 @@ fn log_std_stays_in_its_range_with_a_gradient() {
     assert!(gradient[2] > 0.1 && gradient[3] > 0.1 && gradient[..2] == [0.0; 2], "{gradient:?}");
 }
 
-fn network(members: usize, layer_norm: bool, seed: u64) -> Mlp {
+fn network(members: usize, norm: Norm, seed: u64) -> Mlp {
     let config = MlpConfig {
         members,
         input: 3,
         hidden: vec![16, 16],
-        output: 2,
-        layer_norm,
+        output: Some(2),
+        norm,
         activation: Activation::Relu,
         init: Init::Uniform,
     };
@@ -223,10 +336,10 @@ fn network(members: usize, layer_norm: bool, seed: u64) -> Mlp {
 /// One member of several is the same network as it would be alone.
 #[test]
 fn members_do_not_mix() {
-    let both = network(2, true, 0);
+    let both = network(2, Norm::Layer, 0);
     let x = random((1, 5, 3), &mut rng::stream(5, "x"));
     let y = both.forward(x.clone(), Learning::Frozen);
-    let mut alone = network(1, true, 1);
+    let mut alone = network(1, Norm::Layer, 1);
     for member in 0..2 {
         for ((_, mine), (_, ours)) in alone.parameters_mut().into_iter().zip(both.parameters()) {
             let size = values(ours).len() / 2;
@@ -240,7 +353,7 @@ fn members_do_not_mix() {
 /// Adam against PyTorch's formula, spelt out for one number over three steps.
 #[test]
 fn adam_steps_as_in_the_paper() {
-    let mut module = network(1, false, 2);
+    let mut module = network(1, Norm::None, 2);
     let start = values(module.parameters()[0].1)[0];
     let mut adam = Adam::new(AdamConfig::new(1e-2));
     let (mut m, mut v, mut expected) = (0.0, 0.0, f64::from(start));
@@ -259,7 +372,7 @@ fn adam_steps_as_in_the_paper() {
 
 #[test]
 fn clipping_scales_the_whole_gradient() {
-    let mut module = network(1, false, 3);
+    let mut module = network(1, Norm::None, 3);
     let config = AdamConfig { max_norm: Some(1.0), epsilon: 1.0, ..AdamConfig::new(1.0) };
     let mut gradients = dfdx::tensor::Gradients::leaky();
     let mut count = 0;
@@ -278,7 +391,7 @@ fn clipping_scales_the_whole_gradient() {
 
 #[test]
 fn targets_follow_by_polyak() {
-    let (mut target, mut source) = (network(1, false, 4), network(1, false, 5));
+    let (mut target, mut source) = (network(1, Norm::None, 4), network(1, Norm::None, 5));
     target.parameters_mut().into_iter().for_each(|(_, p)| p.copy_from(&vec![1.0; values(p).len()]));
     source.parameters_mut().into_iter().for_each(|(_, p)| p.copy_from(&vec![2.0; values(p).len()]));
     polyak(&mut target, &source, 0.005);
@@ -293,7 +406,7 @@ fn targets_follow_by_polyak() {
 fn weights_survive_a_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("deep/weights.safetensors");
-    let (saved, mut loaded) = (network(2, true, 6), network(2, true, 7));
+    let (saved, mut loaded) = (network(2, Norm::Layer, 6), network(2, Norm::Layer, 7));
     let mut weights = Weights::default();
     weights.insert_module("critics", &saved);
     weights.insert_counts("counts", &[u64::MAX, 0, 123_456_789_012_345]);
@@ -317,8 +430,8 @@ fn foreign_weights_are_refused_and_change_nothing() {
     assert!(problem.contains("weights.safetensors") && problem.contains("damaged"), "{problem}");
     // Another shape.
     let mut weights = Weights::default();
-    weights.insert_module("critics", &network(2, false, 8));
-    let mut other = network(1, false, 9);
+    weights.insert_module("critics", &network(2, Norm::None, 8));
+    let mut other = network(1, Norm::None, 9);
     let before = values(other.parameters()[0].1).to_vec();
     let problem = weights.load_module("critics", &mut other).expect_err("other shapes").to_string();
     assert!(problem.contains("critics.0.weight"), "{problem}");

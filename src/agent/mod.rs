@@ -1,11 +1,13 @@
 //! Agents: wiring of models, planners and networks behind one small interface.
 
 mod baselines;
+pub mod dreamer;
 mod oracle;
 mod pets;
 mod sac;
 
 pub use baselines::{Random, Scripted};
+pub use dreamer::{Dreamer, DreamerConfig};
 pub use oracle::{Oracle, OracleConfig};
 pub use pets::{Pets, PetsConfig};
 pub use sac::{Sac, SacConfig};

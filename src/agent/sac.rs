@@ -17,8 +17,8 @@ use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::ops;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, SquashedGaussian, Tensor3, Weights, copy_parameters,
-    device, polyak, tensor, values,
+    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, Weights,
+    copy_parameters, device, polyak, tensor, values,
 };
 use crate::replay::{Batch, ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
@@ -118,16 +118,16 @@ impl Sac {
             members: 1,
             input: observations,
             hidden: config.hidden.clone(),
-            output: 2 * actions,
-            layer_norm: false,
+            output: Some(2 * actions),
+            norm: Norm::None,
             activation: Activation::Relu,
             init: Init::Uniform,
         };
         let critics = MlpConfig {
             members: config.critics,
             input: observations + actions,
-            output: 1,
-            layer_norm: config.layer_norm,
+            output: Some(1),
+            norm: if config.layer_norm { Norm::Layer } else { Norm::None },
             ..policy.clone()
         };
         let policy = Mlp::new(&cpu, &policy, &mut rng);
@@ -188,7 +188,7 @@ impl Sac {
         let targets = tensor(&self.cpu, targets, (critics, batch.size, 1));
         let actions = tensor(&self.cpu, batch.actions.clone(), (1, batch.size, self.actions));
         let input = ops::join(self.observations(&batch.obs), actions);
-        let q = self.critics.forward(input.leaky_traced(), Learning::Trained);
+        let q = self.critics.forward(input.leaky_traced(), Learning::FromData);
         let mean_q = values(&q).iter().sum::<f32>() / (critics * batch.size) as f32;
         // The mean over the batch, summed over the critics.
         let loss = (q - targets).square().mean() * critics as f32;
@@ -202,7 +202,7 @@ impl Sac {
     fn update_policy(&mut self, batch: &Batch) -> Losses {
         let obs = self.observations(&batch.obs);
         let noise = self.noise(batch.size);
-        let head = self.policy.forward(obs.clone().leaky_traced(), Learning::Trained);
+        let head = self.policy.forward(obs.clone().leaky_traced(), Learning::FromData);
         let (action, log_density) = SquashedGaussian::from_head(head).sample(noise);
         let log_densities = log_density.as_vec();
         // The critics judge; they do not learn from it.

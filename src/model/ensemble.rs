@@ -19,8 +19,8 @@ use super::{Dynamics, Layout, Normaliser};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Parameters, Tensor3, Weights,
-    bounded_nll, device, tensor, values,
+    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Norm, Parameters, Tensor3,
+    Weights, bounded_nll, device, tensor, values,
 };
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
@@ -164,8 +164,8 @@ impl Ensemble {
             members: config.members,
             input: inputs,
             hidden: config.hidden.clone(),
-            output: 2 * outputs,
-            layer_norm: false,
+            output: Some(2 * outputs),
+            norm: Norm::None,
             activation: Activation::Silu,
             init: Init::TruncatedNormal,
         };

@@ -11,7 +11,9 @@ mod imagination;
 mod layout;
 mod normaliser;
 pub mod open_loop;
+pub mod rssm;
 pub mod uncertainty;
+mod world_model;
 
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
@@ -19,3 +21,5 @@ pub use ensemble::{Ensemble, EnsembleConfig, Fit};
 pub use imagination::{Futures, Imagination, Propagation, Reward, Value};
 pub use layout::Layout;
 pub use normaliser::Normaliser;
+pub use rssm::{Latent, Rssm, RssmConfig};
+pub use world_model::{Lesson, WorldModel, WorldModelConfig};

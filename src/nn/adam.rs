@@ -1,4 +1,5 @@
-//! Adam (Kingma & Ba 2015), with gradient clipping by the global norm and decoupled weight decay.
+//! Adam (Kingma & Ba 2015), with clipping and decoupled weight decay; and LaProp (Ziyin et al. 2020), which is Adam in
+//! another order.
 
 use std::collections::BTreeMap;
 
@@ -24,12 +25,39 @@ pub struct AdamConfig {
     /// Share of itself that a weight loses in a step of size one, whatever its gradient (AdamW, Loshchilov & Hutter
     /// 2019). Biases and other parameters do not.
     pub weight_decay: f32,
+    /// Gradients are divided by the root of their second moment before they enter the first one, instead of after: LaProp.
+    pub normalise_first: bool,
+    /// The gradient of each parameter is scaled down to this share of the parameter's norm, which counts as 1e-3 at least
+    /// (adaptive gradient clipping: Brock et al. 2021, by whole tensors as in DreamerV3).
+    pub adaptive_clip: Option<f32>,
+    /// Steps over which the step size grows to what it will be.
+    pub warm_up: u32,
 }
 
 impl AdamConfig {
     /// The usual settings at this learning rate, without clipping.
     pub fn new(learning_rate: f32) -> Self {
-        Self { learning_rate, betas: [0.9, 0.999], epsilon: 1e-8, max_norm: None, weight_decay: 0.0 }
+        Self {
+            learning_rate,
+            betas: [0.9, 0.999],
+            epsilon: 1e-8,
+            max_norm: None,
+            weight_decay: 0.0,
+            normalise_first: false,
+            adaptive_clip: None,
+            warm_up: 0,
+        }
+    }
+
+    /// DreamerV3's optimiser at this learning rate: LaProp, clipped parameter by parameter, 1000 steps of warm-up.
+    pub fn laprop(learning_rate: f32) -> Self {
+        Self {
+            epsilon: 1e-20,
+            normalise_first: true,
+            adaptive_clip: Some(0.3),
+            warm_up: 1000,
+            ..Self::new(learning_rate)
+        }
     }
 }
 
@@ -69,7 +97,16 @@ impl Adam {
             let decay =
                 if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
             let mut updated = values(parameter).to_vec();
-            update(&mut updated, gradient, first, second, Rule { decay, ..rule });
+            let adaptive = self.config.adaptive_clip.map_or(1.0, |share| {
+                let [size, slope] = [&updated, &*gradient].map(|numbers| sum_of_squares(numbers).sqrt() as f32);
+                (share * size.max(1e-3) / slope.max(f32::MIN_POSITIVE)).min(1.0)
+            });
+            let rule = Rule { decay, clip: clip * adaptive, ..rule };
+            if self.config.normalise_first {
+                update_normalised(&mut updated, gradient, first, second, rule);
+            } else {
+                update(&mut updated, gradient, first, second, rule);
+            }
             parameter.copy_from(&updated);
         });
         self.moments = work.into_iter().map(|(name, _, _, moments)| (name, moments)).collect();
@@ -109,7 +146,8 @@ impl Adam {
 #[derive(Clone, Copy)]
 struct Rule {
     betas: [f32; 2],
-    /// The bias corrections are folded into step size and epsilon.
+    /// The bias corrections of both moments, divided out.
+    corrections: [f32; 2],
     rate: f32,
     epsilon: f32,
     clip: f32,
@@ -118,10 +156,10 @@ struct Rule {
 
 impl Rule {
     fn new(config: &AdamConfig, steps: u32, clip: f32) -> Self {
-        let [first, second] = config.betas.map(|beta| 1.0 - f64::from(beta).powi(steps as i32));
-        let rate = (f64::from(config.learning_rate) * second.sqrt() / first) as f32;
-        let epsilon = (f64::from(config.epsilon) * second.sqrt()) as f32;
-        Self { betas: config.betas, rate, epsilon, clip, decay: 0.0 }
+        let corrections = config.betas.map(|beta| (1.0 / (1.0 - f64::from(beta).powi(steps as i32))) as f32);
+        let warm = if steps < config.warm_up { (steps - 1) as f32 / config.warm_up as f32 } else { 1.0 };
+        let rate = warm * config.learning_rate;
+        Self { betas: config.betas, corrections, rate, epsilon: config.epsilon, clip, decay: 0.0 }
     }
 }
 
@@ -133,12 +171,30 @@ vectorised_fn! {
         second: &'a mut [f32],
         rule: Rule,
     ) {
-        let Rule { betas: [beta1, beta2], rate, epsilon, clip, decay } = rule;
+        let Rule { betas: [beta1, beta2], corrections: [of_first, of_second], rate, epsilon, clip, decay } = rule;
         for (((p, g), m), v) in parameter.iter_mut().zip(gradient).zip(first).zip(second) {
             let g = clip * g;
             *m += (1.0 - beta1) * (g - *m);
             *v += (1.0 - beta2) * (g * g - *v);
-            *p -= decay * *p + rate * *m / (v.sqrt() + epsilon);
+            *p -= decay * *p + rate * (of_first * *m) / ((of_second * *v).sqrt() + epsilon);
+        }
+    }
+}
+
+vectorised_fn! {
+    fn update_normalised(
+        parameter: &'a mut [f32],
+        gradient: &'a [f32],
+        first: &'a mut [f32],
+        second: &'a mut [f32],
+        rule: Rule,
+    ) {
+        let Rule { betas: [beta1, beta2], corrections: [of_first, of_second], rate, epsilon, clip, decay } = rule;
+        for (((p, g), m), v) in parameter.iter_mut().zip(gradient).zip(first).zip(second) {
+            let g = clip * g;
+            *v += (1.0 - beta2) * (g * g - *v);
+            *m += (1.0 - beta1) * (g / ((of_second * *v).sqrt() + epsilon) - *m);
+            *p -= decay * *p + rate * of_first * *m;
         }
     }
 }

@@ -1,8 +1,9 @@
-//! The squashed Gaussian of SAC: `a = tanh(u)`, `u ~ N(mean, std^2)`.
+//! The Gaussians that policies act by: SAC's, squashed (`a = tanh(u)`, `u ~ N(mean, std^2)`), and DreamerV3's, bounded.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
+use super::kernels::{sigmoid, tanh};
 use super::{Tensor2, Tensor3};
 
 /// Log standard deviations are squashed into this range, so that their gradient never dies as it
@@ -52,5 +53,91 @@ impl<T: Tape<f32, Cpu>> SquashedGaussian<T> {
     /// The action at the mean: what a policy does when it is judged.
     pub fn mode(self) -> Tensor3<T> {
         self.mean.tanh()
+    }
+}
+
+/// The bounded Gaussian of DreamerV3 for one number of an action: the mean lies in (-1, 1), the deviation between two
+/// bounds. What is drawn is not squashed; the world cuts it off.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BoundedNormal {
+    /// The mean, `tanh(raw)`.
+    pub mean: f32,
+    /// The standard deviation, `(high - low) sigmoid(raw + 2) + low`.
+    pub std: f32,
+    /// The slopes of mean and deviation with respect to the raw numbers.
+    slopes: [f32; 2],
+}
+
+impl BoundedNormal {
+    /// The largest deviation.
+    const HIGH: f32 = 1.0;
+
+    /// The distribution that two raw numbers of a policy's head describe; no deviation is smaller than `low`.
+    pub fn new(raw_mean: f32, raw_std: f32, low: f32) -> Self {
+        let mean = tanh(raw_mean);
+        let share = sigmoid(raw_std + 2.0);
+        let range = Self::HIGH - low;
+        Self { mean, std: range * share + low, slopes: [1.0 - mean * mean, range * share * (1.0 - share)] }
+    }
+
+    /// Logarithm of the density at `action`.
+    pub fn log_density(&self, action: f32) -> f32 {
+        let z = (action - self.mean) / self.std;
+        -0.5 * (z * z + (2.0 * std::f32::consts::PI).ln()) - self.std.ln()
+    }
+
+    /// Entropy, in nats.
+    pub fn entropy(&self) -> f32 {
+        0.5 * (1.0 + (2.0 * std::f32::consts::PI).ln()) + self.std.ln()
+    }
+
+    /// The slopes of `density weight * log density + entropy weight * entropy` with respect to the raw mean and the raw
+    /// deviation.
+    pub fn slopes(&self, action: f32, of_density: f32, of_entropy: f32) -> [f32; 2] {
+        let z = (action - self.mean) / self.std;
+        let [mean, std] = self.slopes;
+        [of_density * z / self.std * mean, (of_density * (z * z - 1.0) + of_entropy) / self.std * std]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Numbers from the reference's formulas, in float64.
+    #[test]
+    fn the_bounded_normal_is_the_references() {
+        let near =
+            |found: f32, expected: f64| assert!((f64::from(found) - expected).abs() < 2e-6, "{found} {expected}");
+        for (raw, std, entropy) in [
+            (0.0, 0.892_717_37, 1.305_453_29),
+            (1.0, 0.957_316_71, 1.375_317_54),
+            (-2.0, 0.55, 0.821_101_53),
+            (-6.0, 0.116_187_59, -0.733_610_71),
+        ] {
+            let normal = BoundedNormal::new(0.0, raw, 0.1);
+            near(normal.std, std);
+            near(normal.entropy(), entropy);
+        }
+        let pair = [BoundedNormal::new(0.5, 0.2, 0.1), BoundedNormal::new(-0.3, -1.0, 0.1)];
+        near(pair[0].mean, 0.462_117_16);
+        near(pair[1].mean, -0.291_312_61);
+        near(pair[0].log_density(0.9), -0.940_589_35);
+        near(pair[1].log_density(-1.4), -1.711_607_69);
+        near(pair[0].entropy() + pair[1].entropy(), 2.466_678_86);
+    }
+
+    #[test]
+    fn its_slopes_agree_with_differences() {
+        let (raw_mean, raw_std, action) = (0.4, -0.7, 1.1);
+        let value = |m: f32, s: f32| {
+            let normal = BoundedNormal::new(m, s, 0.1);
+            f64::from(2.0 * normal.log_density(action) + 0.5 * normal.entropy())
+        };
+        const H: f32 = 1e-2;
+        let [of_mean, of_std] = BoundedNormal::new(raw_mean, raw_std, 0.1).slopes(action, 2.0, 0.5);
+        let by_mean = (value(raw_mean + H, raw_std) - value(raw_mean - H, raw_std)) / f64::from(2.0 * H);
+        let by_std = (value(raw_mean, raw_std + H) - value(raw_mean, raw_std - H)) / f64::from(2.0 * H);
+        assert!((f64::from(of_mean) - by_mean).abs() < 1e-3 && (f64::from(of_std) - by_std).abs() < 1e-3);
     }
 }

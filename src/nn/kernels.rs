@@ -46,17 +46,29 @@ impl<'a> Matrix<'a> {
         assert!(from <= to && to <= self.rows);
         Self { data: &self.data[from * self.row_stride as usize..], rows: to - from, ..self }
     }
+
+    /// The columns `from..to`.
+    pub fn columns(self, from: usize, to: usize) -> Self {
+        self.t().rows(from, to).t()
+    }
 }
 
 /// `out = a b`, or `out += a b`; `out` is row-major and contiguous. Single-threaded.
 pub fn matmul(out: &mut [f32], a: Matrix, b: Matrix, accumulate: bool) {
-    assert_eq!(a.cols, b.rows, "inner sizes agree");
     assert_eq!(out.len(), a.rows * b.cols, "the product fits");
-    if out.is_empty() {
+    matmul_into(out, b.cols, a, b, accumulate);
+}
+
+/// The same, into some columns of a wider matrix: `out` begins at the product's first number, and its rows lie
+/// `row_stride` apart.
+pub fn matmul_into(out: &mut [f32], row_stride: usize, a: Matrix, b: Matrix, accumulate: bool) {
+    assert_eq!(a.cols, b.rows, "inner sizes agree");
+    if a.rows == 0 || b.cols == 0 {
         return;
     }
-    // SAFETY: both views lie within their slices (see `Matrix::new`, `t`, `rows`), `out` holds
-    // exactly the product, and it is borrowed mutably, so nothing aliases it.
+    assert!(row_stride >= b.cols && out.len() >= (a.rows - 1) * row_stride + b.cols, "the product fits");
+    // SAFETY: both views lie within their slices (see `Matrix::new`, `t`, `rows`, `columns`), `out` holds the product
+    // (just asserted), and it is borrowed mutably, so nothing aliases it.
     unsafe {
         gemm::gemm(
             a.rows,
@@ -64,7 +76,7 @@ pub fn matmul(out: &mut [f32], a: Matrix, b: Matrix, accumulate: bool) {
             a.cols,
             out.as_mut_ptr(),
             1,
-            b.cols as isize,
+            row_stride as isize,
             accumulate,
             a.data.as_ptr(),
             a.col_stride,
@@ -137,6 +149,12 @@ pub fn exp(x: f32) -> f32 {
     series * f32::from_bits((rounded.to_bits() << 23).wrapping_add(1.0_f32.to_bits()))
 }
 
+/// The hyperbolic tangent, to 3e-7.
+#[inline(always)]
+pub fn tanh(x: f32) -> f32 {
+    2.0 * sigmoid(2.0 * x) - 1.0
+}
+
 /// ln(1 + exp(x)), to 1e-7 of itself or of one.
 #[inline(always)]
 pub fn softplus(x: f32) -> f32 {
@@ -152,12 +170,12 @@ pub fn softplus(x: f32) -> f32 {
 }
 
 #[inline(always)]
-fn silu(x: f32) -> f32 {
+pub(crate) fn silu(x: f32) -> f32 {
     x * sigmoid(x)
 }
 
 #[inline(always)]
-fn silu_slope(x: f32) -> f32 {
+pub(crate) fn silu_slope(x: f32) -> f32 {
     let s = sigmoid(x);
     s * (1.0 + x * (1.0 - s))
 }

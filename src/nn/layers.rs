@@ -5,7 +5,7 @@ use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
 use super::ops::{self, Learning, Tensor3, values};
-use super::{Activation, kernels};
+use super::{Activation, kernels, norm};
 use crate::rng::{self, Rng};
 
 /// Something with named parameters, each `[members, rows, columns]`.
@@ -43,14 +43,26 @@ pub struct MlpConfig {
     pub input: usize,
     /// Width of each hidden layer.
     pub hidden: Vec<usize>,
-    /// Output features.
-    pub output: usize,
-    /// Whether hidden layers are normalised before their activation.
-    pub layer_norm: bool,
+    /// Output features of the last, affine layer; without one, the last hidden layer is the output.
+    pub output: Option<usize>,
+    /// How hidden layers are normalised before their activation.
+    pub norm: Norm,
     /// What follows each hidden layer.
     pub activation: Activation,
     /// How parameters are drawn.
     pub init: Init,
+}
+
+/// How the rows of a hidden layer are normalised.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Norm {
+    /// Not at all.
+    None,
+    /// To mean 0 and deviation 1: [`norm::layer_norm`].
+    Layer,
+    /// To a root mean square of 1: [`norm::rms_norm`].
+    Rms,
 }
 
 /// How the parameters of a layer of n inputs are drawn.
@@ -61,50 +73,81 @@ pub enum Init {
     Uniform,
     /// Weights normal with deviation 1 / (2 sqrt(n)), cut off at two deviations; biases zero: as in PETS.
     TruncatedNormal,
+    /// Weights normal and cut off at two deviations, with deviation 1 / sqrt(n) after the cut; biases zero: as in
+    /// DreamerV3.
+    Lecun,
 }
 
-/// Fully connected networks: affine, optional layer normalisation, activation; the last layer is affine.
+impl Init {
+    /// The numbers of a weight of `inputs` rows, or of a bias.
+    pub(crate) fn draw(self, count: usize, inputs: usize, is_bias: bool, rng: &mut Rng) -> Vec<f32> {
+        // The deviation of a standard normal number that is cut off at two deviations.
+        const TRUNCATED: f64 = 0.879_625_661_034_239_8;
+        let bound = 1.0 / (inputs as f64).sqrt();
+        let number = |_| match self {
+            Self::Uniform => rng::uniform(rng, -bound, bound),
+            _ if is_bias => 0.0,
+            Self::TruncatedNormal => 0.5 * bound * rng::truncated_normal(rng),
+            Self::Lecun => bound / TRUNCATED * rng::truncated_normal(rng),
+        };
+        (0..count).map(number).map(|x| x as f32).collect()
+    }
+}
+
+/// Fully connected networks: affine, optional normalisation, activation; the last layer is affine.
 #[derive(Clone, Debug)]
 pub struct Mlp {
     layers: Vec<Layer>,
-    activation: Activation,
 }
 
 #[derive(Clone, Debug)]
 struct Layer {
     weight: Tensor3,
     bias: Tensor3,
-    /// Gain and shift.
-    norm: Option<(Tensor3, Tensor3)>,
+    norm: NormParameters,
+    activation: Activation,
+}
+
+#[derive(Clone, Debug)]
+enum NormParameters {
+    None,
+    Layer { gain: Tensor3, shift: Tensor3 },
+    Rms { gain: Tensor3 },
 }
 
 impl Mlp {
     /// New networks.
     pub fn new(cpu: &Cpu, config: &MlpConfig, rng: &mut Rng) -> Self {
-        let sizes: Vec<usize> = [config.input].iter().chain(&config.hidden).chain([&config.output]).copied().collect();
+        let sizes: Vec<usize> =
+            [config.input].into_iter().chain(config.hidden.iter().copied()).chain(config.output).collect();
         let members = config.members;
-        let mut layers = Vec::with_capacity(sizes.len() - 1);
-        for (i, size) in sizes.windows(2).enumerate() {
+        let layer = |(i, size): (usize, &[usize])| {
             let (input, output) = (size[0], size[1]);
-            let bound = 1.0 / (input as f64).sqrt();
-            let mut draw = |rows: usize| {
-                let number = |_| match config.init {
-                    Init::Uniform => rng::uniform(rng, -bound, bound),
-                    Init::TruncatedNormal if rows == 1 => 0.0,
-                    Init::TruncatedNormal => 0.5 * bound * rng::truncated_normal(rng),
-                };
-                let numbers = (0..members * rows * output).map(number).map(|x| x as f32).collect();
-                super::tensor(cpu, numbers, (members, rows, output))
+            let weight = config.init.draw(members * input * output, input, false, rng);
+            let bias = config.init.draw(members * output, input, true, rng);
+            let filled = |x: f32| super::tensor(cpu, vec![x; members * output], (members, 1, output));
+            let hidden = i < config.hidden.len();
+            let norm = match config.norm {
+                Norm::Layer if hidden => NormParameters::Layer { gain: filled(1.0), shift: filled(0.0) },
+                Norm::Rms if hidden => NormParameters::Rms { gain: filled(1.0) },
+                _ => NormParameters::None,
             };
-            let (weight, bias) = (draw(input), draw(1));
-            let hidden = i + 2 < sizes.len();
-            let norm = (hidden && config.layer_norm).then(|| {
-                let filled = |x: f32| super::tensor(cpu, vec![x; members * output], (members, 1, output));
-                (filled(1.0), filled(0.0))
-            });
-            layers.push(Layer { weight, bias, norm });
-        }
-        Self { layers, activation: config.activation }
+            Layer {
+                weight: super::tensor(cpu, weight, (members, input, output)),
+                bias: super::tensor(cpu, bias, (members, 1, output)),
+                norm,
+                activation: if hidden { config.activation } else { Activation::Identity },
+            }
+        };
+        Self { layers: sizes.windows(2).enumerate().map(layer).collect() }
+    }
+
+    /// Multiplies the weights of the last layer by `factor`: with 0, the network says the same of everything at first.
+    pub fn scale_output(mut self, factor: f32) -> Self {
+        let last = self.layers.last_mut().expect("a layer");
+        let scaled: Vec<f32> = values(&last.weight).iter().map(|w| factor * w).collect();
+        last.weight.copy_from(&scaled);
+        self
     }
 
     /// Networks of the given layers, each a weight `[input, output]` and a bias `[output]`, for each member.
@@ -118,9 +161,11 @@ impl Mlp {
             let output = biases.len() / members.len();
             let input = weights.len() / biases.len();
             let weight = super::tensor(cpu, weights, (members.len(), input, output));
-            Layer { weight, bias: super::tensor(cpu, biases, (members.len(), 1, output)), norm: None }
+            let activation = if i + 1 < members[0].len() { activation } else { Activation::Identity };
+            let bias = super::tensor(cpu, biases, (members.len(), 1, output));
+            Layer { weight, bias, norm: NormParameters::None, activation }
         };
-        Self { layers: (0..members[0].len()).map(layer).collect(), activation }
+        Self { layers: (0..members[0].len()).map(layer).collect() }
     }
 
     /// Weight `[input, output]` and bias `[output]` of each layer of one network, without tape: what planners run on.
@@ -136,14 +181,18 @@ impl Mlp {
 
     /// The outputs for `x` (`[members or 1, batch, input]`).
     pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Learning) -> Tensor3<T> {
-        let last = self.layers.len() - 1;
-        self.layers.iter().enumerate().fold(x, |x, (i, Layer { weight, bias, norm })| {
-            let activation = if i < last { self.activation } else { Activation::Identity };
+        self.layers.iter().enumerate().fold(x, |x, (i, Layer { weight, bias, norm, activation })| {
+            // Beyond the first layer, the input is no data.
+            let within = if i > 0 && learning == Learning::FromData { Learning::Trained } else { learning };
+            let affine = |x, activation| ops::dense(x, weight, bias, activation, within);
+            let inside = if learning == Learning::Frozen { learning } else { Learning::Trained };
             match norm {
-                None => ops::dense(x, weight, bias, activation, learning),
-                Some((gain, shift)) => {
-                    let x = ops::dense(x, weight, bias, Activation::Identity, learning);
-                    ops::layer_norm(x, gain, shift, activation, learning)
+                NormParameters::None => affine(x, *activation),
+                NormParameters::Layer { gain, shift } => {
+                    norm::layer_norm(affine(x, Activation::Identity), gain, shift, *activation, inside)
+                }
+                NormParameters::Rms { gain } => {
+                    norm::rms_norm(affine(x, Activation::Identity), gain, *activation, inside)
                 }
             }
         })
@@ -153,12 +202,14 @@ impl Mlp {
 impl Parameters for Mlp {
     fn parameters(&self) -> Vec<(String, &Tensor3)> {
         let mut all = Vec::new();
-        for (i, layer) in self.layers.iter().enumerate() {
-            all.push((format!("{i}.weight"), &layer.weight));
-            all.push((format!("{i}.bias"), &layer.bias));
-            if let Some((gain, shift)) = &layer.norm {
-                all.push((format!("{i}.gain"), gain));
-                all.push((format!("{i}.shift"), shift));
+        for (i, Layer { weight, bias, norm, .. }) in self.layers.iter().enumerate() {
+            all.extend([(format!("{i}.weight"), weight), (format!("{i}.bias"), bias)]);
+            match norm {
+                NormParameters::None => {}
+                NormParameters::Layer { gain, shift } => {
+                    all.extend([(format!("{i}.gain"), gain), (format!("{i}.shift"), shift)]);
+                }
+                NormParameters::Rms { gain } => all.push((format!("{i}.gain"), gain)),
             }
         }
         all
@@ -166,14 +217,41 @@ impl Parameters for Mlp {
 
     fn parameters_mut(&mut self) -> Vec<(String, &mut Tensor3)> {
         let mut all = Vec::new();
-        for (i, layer) in self.layers.iter_mut().enumerate() {
-            all.push((format!("{i}.weight"), &mut layer.weight));
-            all.push((format!("{i}.bias"), &mut layer.bias));
-            if let Some((gain, shift)) = &mut layer.norm {
-                all.push((format!("{i}.gain"), gain));
-                all.push((format!("{i}.shift"), shift));
+        for (i, Layer { weight, bias, norm, .. }) in self.layers.iter_mut().enumerate() {
+            all.extend([(format!("{i}.weight"), weight), (format!("{i}.bias"), bias)]);
+            match norm {
+                NormParameters::None => {}
+                NormParameters::Layer { gain, shift } => {
+                    all.extend([(format!("{i}.gain"), gain), (format!("{i}.shift"), shift)]);
+                }
+                NormParameters::Rms { gain } => all.push((format!("{i}.gain"), gain)),
             }
         }
         all
     }
+}
+
+/// Makes a struct's parameters those of some of its fields, each under the field's name.
+macro_rules! parameters_of_fields {
+    ($type:ty: $($field:ident),*) => {
+        impl $crate::nn::Parameters for $type {
+            fn parameters(&self) -> Vec<(String, &$crate::nn::Tensor3)> {
+                let parts = [$((stringify!($field), self.$field.parameters())),*];
+                $crate::nn::layers::under_names(parts)
+            }
+
+            fn parameters_mut(&mut self) -> Vec<(String, &mut $crate::nn::Tensor3)> {
+                let parts = [$((stringify!($field), self.$field.parameters_mut())),*];
+                $crate::nn::layers::under_names(parts)
+            }
+        }
+    };
+}
+pub(crate) use parameters_of_fields;
+
+pub(crate) fn under_names<T>(parts: impl IntoIterator<Item = (&'static str, Vec<(String, T)>)>) -> Vec<(String, T)> {
+    let under = |(part, all): (&str, Vec<(String, T)>)| -> Vec<(String, T)> {
+        all.into_iter().map(|(name, parameter)| (format!("{part}.{name}"), parameter)).collect()
+    };
+    parts.into_iter().flat_map(under).collect()
 }

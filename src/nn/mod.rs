@@ -6,20 +6,28 @@
 //! run through the same code.
 
 mod adam;
+pub mod categorical;
 mod gaussian;
 pub mod kernels;
-mod layers;
+pub(crate) mod layers;
 mod likelihood;
+pub mod norm;
 pub mod ops;
+pub mod recurrent;
+pub mod two_hot;
 mod weights;
 
 pub use adam::{Adam, AdamConfig};
+pub use categorical::Categorical;
 pub use dfdx;
-pub use gaussian::SquashedGaussian;
+pub use gaussian::{BoundedNormal, SquashedGaussian};
 pub use kernels::Activation;
-pub use layers::{Init, Mlp, MlpConfig, Parameters, copy_parameters, polyak};
+pub(crate) use layers::parameters_of_fields;
+pub use layers::{Init, Mlp, MlpConfig, Norm, Parameters, copy_parameters, polyak};
 pub use likelihood::{LogVarianceBounds, bounded, bounded_nll};
 pub use ops::{Learning, Tensor2, Tensor3, values};
+pub use recurrent::BlockDense;
+pub use two_hot::SymexpBins;
 pub use weights::Weights;
 
 use dfdx::tensor::{Cache, Cpu, TensorFrom};

@@ -40,11 +40,13 @@ pub(crate) fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<
     Ok(std::mem::take(gradients.get_or_alloc_mut(of)?))
 }
 
-/// Whether an operation's parameters learn.
+/// Where an operation's gradients flow to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Learning {
     /// Gradients flow into the parameters and through to the input.
     Trained,
+    /// Gradients flow into the parameters only: the input is data, and nobody asks for its gradient.
+    FromData,
     /// Gradients flow through to the input only.
     Frozen,
 }
@@ -85,107 +87,20 @@ pub fn dense<T: Tape<f32, Cpu>>(
         tape.add_backward_op(move |gradients| {
             let mut dz = take(gradients, &y)?;
             kernels::through_activation(&mut dz, before.as_deref().unwrap_or(values(&y)), activation);
-            if learning == Learning::Trained {
+            if learning != Learning::Frozen {
                 let mut db = take(gradients, &b)?;
                 let dw = gradients.get_or_alloc_mut(&w)?;
                 kernels::dense_parameter_gradients(dw, &mut db, values(&x), &dz, shape);
                 **gradients.get_or_alloc_mut(&b)? = db;
             }
-            let dx = gradients.get_or_alloc_mut(&x)?;
-            kernels::dense_input_gradient(dx, &dz, values(&w), shape);
-            Ok(())
-        });
-    }
-    y.put_tape(tape)
-}
-
-/// Layer normalisation (Ba et al. 2016) over the last axis, then the activation:
-/// `activation(gain (x - mean) / sqrt(variance + 1e-5) + shift)`; gain and shift `[members, 1, features]`.
-pub fn layer_norm<T: Tape<f32, Cpu>>(
-    x: Tensor3<T>,
-    gain: &Tensor3,
-    shift: &Tensor3,
-    activation: Activation,
-    learning: Learning,
-) -> Tensor3<T> {
-    const EPSILON: f32 = 1e-5;
-    let (x, mut tape) = x.split_tape();
-    let &(members, batch, features) = x.shape();
-    assert_eq!(*gain.shape(), (members, 1, features), "the gain's shape");
-    assert_eq!(*shift.shape(), (members, 1, features), "the shift's shape");
-
-    // Normalised values and 1/std are what the gradient needs.
-    let mut normal = values(&x).to_vec();
-    let mut inverse_std = vec![0.0; members * batch];
-    let mut y = vec![0.0; normal.len()];
-    let n = features as f32;
-    for (row, normal) in normal.chunks_exact_mut(features).enumerate() {
-        let of_member = row / batch * features..;
-        let (gain, shift) = (&values(gain)[of_member.clone()][..features], &values(shift)[of_member][..features]);
-        let y = &mut y[row * features..][..features];
-        kernels::vectorised(|| {
-            let mean = sum(normal.iter().copied()) / n;
-            let variance = sum(normal.iter().map(|x| (x - mean) * (x - mean))) / n;
-            let scale = 1.0 / (variance + EPSILON).sqrt();
-            inverse_std[row] = scale;
-            for (((x, y), gain), shift) in normal.iter_mut().zip(y).zip(gain).zip(shift) {
-                *x = (*x - mean) * scale;
-                *y = gain * *x + shift;
-            }
-        });
-    }
-    let before = before_activation(&mut y, activation);
-    let y = x.device().tensor_from_vec(y, (members, batch, features));
-
-    if T::OWNS_TAPE {
-        let (gain, shift, y) = (gain.clone(), shift.clone(), y.clone());
-        tape.add_backward_op(move |gradients| {
-            let mut dz = take(gradients, &y)?;
-            kernels::through_activation(&mut dz, &before, activation);
-            if learning == Learning::Trained {
-                let mut d_gain = take(gradients, &gain)?;
-                let d_shift = gradients.get_or_alloc_mut(&shift)?;
-                for (row, (dz, x)) in dz.chunks_exact(features).zip(normal.chunks_exact(features)).enumerate() {
-                    let of_member = row / batch * features..;
-                    let (d_gain, d_shift) =
-                        (&mut d_gain[of_member.clone()][..features], &mut d_shift[of_member][..features]);
-                    kernels::vectorised(|| {
-                        for (((d_gain, d_shift), dz), x) in d_gain.iter_mut().zip(d_shift).zip(dz).zip(x) {
-                            *d_gain += dz * x;
-                            *d_shift += dz;
-                        }
-                    });
-                }
-                **gradients.get_or_alloc_mut(&gain)? = d_gain;
-            }
-            // dx = (g - mean(g) - x mean(g x)) / std, with g = gain dz and x normalised.
-            let dx = gradients.get_or_alloc_mut(&x)?;
-            for (row, dx) in dx.chunks_exact_mut(features).enumerate() {
-                let gain = &values(&gain)[row / batch * features..][..features];
-                let (dz, x) = (&dz[row * features..][..features], &normal[row * features..][..features]);
-                kernels::vectorised(|| {
-                    let g = || gain.iter().zip(dz).map(|(gain, dz)| gain * dz);
-                    let mean_g = sum(g()) / n;
-                    let mean_gx = sum(g().zip(x).map(|(g, x)| g * x)) / n;
-                    for ((dx, g), x) in dx.iter_mut().zip(g()).zip(x) {
-                        *dx += (g - mean_g - x * mean_gx) * inverse_std[row];
-                    }
-                });
+            if learning != Learning::FromData {
+                let dx = gradients.get_or_alloc_mut(&x)?;
+                kernels::dense_input_gradient(dx, &dz, values(&w), shape);
             }
             Ok(())
         });
     }
     y.put_tape(tape)
-}
-
-/// A sum in eight lanes, which vectorises (floating-point addition may not be reordered otherwise).
-#[inline(always)]
-fn sum(values: impl Iterator<Item = f32>) -> f32 {
-    let mut lanes = [0.0; 8];
-    for (i, value) in values.enumerate() {
-        lanes[i % 8] += value;
-    }
-    lanes.iter().sum()
 }
 
 /// Joins two tensors along their last axis: `[members, batch, a]` and `[members, batch, b]`.
@@ -211,6 +126,122 @@ pub fn join<T: Tape<f32, Cpu> + Merge<R>, R: Tape<f32, Cpu>>(a: Tensor3<T>, b: T
                 for (d, dy) in d.chunks_exact_mut(width).zip(dy.chunks_exact(wide)) {
                     d.iter_mut().zip(&dy[from..from + width]).for_each(|(d, dy)| *d += dy);
                 }
+            }
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// Records an operation on a tape that is handed on from one to the next: in a loop over time, where a result is used
+/// several times, that is simpler than tensors which each carry a tape of their own.
+pub fn record<T: Tape<f32, Cpu>>(
+    tape: &mut T,
+    x: &Tensor3,
+    operation: impl FnOnce(Tensor3<T>) -> Tensor3<T>,
+) -> Tensor3 {
+    let (y, recorded) = operation(x.clone().put_tape(std::mem::take(tape))).split_tape();
+    *tape = recorded;
+    y
+}
+
+/// The rows `from..from + count` of a single network's tensor.
+pub fn rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, from: usize, count: usize) -> Tensor3<T> {
+    let (x, mut tape) = x.split_tape();
+    let &(members, _, features) = x.shape();
+    assert_eq!(members, 1, "rows of one network");
+    let part = values(&x)[from * features..][..count * features].to_vec();
+    let y = x.device().tensor_from_vec(part, (1, count, features));
+    if T::OWNS_TAPE {
+        let y = y.clone();
+        tape.add_backward_op(move |gradients| {
+            let dy = take(gradients, &y)?;
+            let dx = &mut gradients.get_or_alloc_mut(&x)?[from * features..][..count * features];
+            dx.iter_mut().zip(dy).for_each(|(dx, dy)| *dx += dy);
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// Puts the rows of several tensors of a single network one below the other.
+pub fn stack<T: Tape<f32, Cpu>>(mut tape: T, parts: &[Tensor3]) -> Tensor3<T> {
+    let &(_, _, features) = parts[0].shape();
+    let stacked: Vec<f32> = parts.iter().flat_map(values).copied().collect();
+    let y = parts[0].device().tensor_from_vec(stacked, (1, parts.iter().map(|part| part.shape().1).sum(), features));
+    if T::OWNS_TAPE {
+        let (y, parts) = (y.clone(), parts.to_vec());
+        tape.add_backward_op(move |gradients| {
+            let mut dy = &take(gradients, &y)?[..];
+            for part in &parts {
+                let d = gradients.get_or_alloc_mut(part)?;
+                let (own, rest) = dy.split_at(d.len());
+                d.iter_mut().zip(own).for_each(|(d, dy)| *d += dy);
+                dy = rest;
+            }
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// Multiplies every row of a single network's tensor by a number of its own.
+pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<T> {
+    let (x, mut tape) = x.split_tape();
+    let &(_, batch, features) = x.shape();
+    assert_eq!(factors.len(), batch, "a factor for each row");
+    let factors = factors.to_vec();
+    let scaled = move |numbers: &[f32]| -> Vec<f32> {
+        let rows = numbers.chunks_exact(features).zip(&factors);
+        rows.flat_map(|(row, factor)| row.iter().map(move |x| x * factor)).collect()
+    };
+    let y = x.device().tensor_from_vec(scaled(values(&x)), (1, batch, features));
+    if T::OWNS_TAPE {
+        let y = y.clone();
+        tape.add_backward_op(move |gradients| {
+            let dy = scaled(&take(gradients, &y)?);
+            gradients.get_or_alloc_mut(&x)?.iter_mut().zip(dy).for_each(|(dx, dy)| *dx += dy);
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// A number for each row, `[members, batch, 1]`: `loss(row's number, row, slope)` returns it and writes its gradient with
+/// respect to the row into `slope`. Losses with a short gradient of their own are best written so.
+pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3<T> {
+    let (x, mut tape) = x.split_tape();
+    let &(members, batch, features) = x.shape();
+    let mut slopes = vec![0.0; members * batch * features];
+    let rows = values(&x).chunks_exact(features).zip(slopes.chunks_exact_mut(features)).enumerate();
+    let losses = rows.map(|(i, (row, slope))| loss(i, row, slope)).collect();
+    let y = x.device().tensor_from_vec(losses, (members, batch, 1));
+    if T::OWNS_TAPE {
+        let y = y.clone();
+        tape.add_backward_op(move |gradients| {
+            let dy = take(gradients, &y)?;
+            let dx = gradients.get_or_alloc_mut(&x)?;
+            for ((dx, slope), dy) in dx.chunks_exact_mut(features).zip(slopes.chunks_exact(features)).zip(dy) {
+                dx.iter_mut().zip(slope).for_each(|(dx, slope)| *dx += dy * slope);
+            }
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// The sum of the means of several losses `[1, batch, 1]`, each times a weight: what is differentiated.
+pub fn total<T: Tape<f32, Cpu>>(mut tape: T, losses: &[(f32, Tensor3)]) -> Tensor<Rank0, f32, Cpu, T> {
+    let mean = |loss: &Tensor3| values(loss).iter().sum::<f32>() / loss.shape().1 as f32;
+    let sum: f32 = losses.iter().map(|(weight, loss)| weight * mean(loss)).sum();
+    let y = super::device().tensor(sum);
+    if T::OWNS_TAPE {
+        let (y, losses) = (y.clone(), losses.to_vec());
+        tape.add_backward_op(move |gradients| {
+            let dy = gradients.get_or_alloc_mut(&y)?[0];
+            for (weight, loss) in &losses {
+                let each = dy * weight / loss.shape().1 as f32;
+                gradients.get_or_alloc_mut(loss)?.iter_mut().for_each(|d| *d += each);
             }
             Ok(())
         });

@@ -6,18 +6,22 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::agent::{Agent, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted};
+use crate::agent::{
+    Agent, Dreamer, DreamerConfig, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted,
+};
 use crate::env::tabletop::TableOptions;
 use crate::env::{Env, Task, World};
 use crate::error::{Error, Result};
 
 /// The presets that come with the crate: the methods that the command line knows. A preset's table
 /// `for.TASK` holds what differs for that task.
-const PRESETS: [(&str, &str); 6] = [
+const PRESETS: [(&str, &str); 8] = [
     ("random", include_str!("../../data/presets/random.toml")),
     ("scripted", include_str!("../../data/presets/scripted.toml")),
     ("oracle", include_str!("../../data/presets/oracle.toml")),
     ("pets", include_str!("../../data/presets/pets.toml")),
+    ("dreamer", include_str!("../../data/presets/dreamer.toml")),
+    ("size1m", include_str!("../../data/presets/size1m.toml")),
     ("sac", include_str!("../../data/presets/sac.toml")),
     ("debug", include_str!("../../data/presets/debug.toml")),
 ];
@@ -39,6 +43,8 @@ pub enum AgentKind {
     Oracle,
     /// [`Pets`].
     Pets,
+    /// [`Dreamer`].
+    Dreamer,
     /// [`Sac`].
     Sac,
 }
@@ -75,6 +81,9 @@ pub struct RunConfig {
     /// Settings of PETS, for agents of that kind.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pets: Option<PetsConfig>,
+    /// Settings of Dreamer, for agents of that kind.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dreamer: Option<DreamerConfig>,
     /// Settings of SAC, for agents of that kind.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sac: Option<SacConfig>,
@@ -152,7 +161,7 @@ impl RunConfig {
 
     /// Whether the method learns; the others are only tested.
     pub fn learns(&self) -> bool {
-        self.steps > 0 && matches!(self.agent, AgentKind::Pets | AgentKind::Sac)
+        self.steps > 0 && matches!(self.agent, AgentKind::Pets | AgentKind::Dreamer | AgentKind::Sac)
     }
 
     /// The run's world.
@@ -178,6 +187,9 @@ impl RunConfig {
             AgentKind::Pets => {
                 let spec = world.spec().clone();
                 Box::new(Pets::new(&spec, Arc::new(world), self.pets.clone().unwrap_or_default(), self.seed)?)
+            }
+            AgentKind::Dreamer => {
+                Box::new(Dreamer::new(world.spec(), self.dreamer.clone().unwrap_or_default(), self.seed)?)
             }
             AgentKind::Sac => Box::new(Sac::new(world.spec(), self.sac.clone().unwrap_or_default(), self.seed)?),
         })

@@ -1,0 +1,384 @@
+//! DreamerV3 (Hafner et al. 2023), small: learn a latent world model, and in it, asleep, an actor and a critic.
+//!
+//! Only wiring: the world is in [`crate::model`], actor and critic are in [`ActorCritic`], planners in [`crate::plan`].
+//! Losses, networks and constants are the reference implementation's. Deviations: stretches of experience start with a
+//! blank memory, new experience is not given precedence in the replay, and when it is judged the policy acts by its mean.
+
+mod actor_critic;
+mod planner;
+mod returns;
+
+use dfdx::prelude::*;
+use dfdx::tensor::{Cpu, Gradients};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+pub use actor_critic::{ActorCritic, ActorCriticConfig, Dream, SlowCritic};
+pub use planner::Imagined;
+pub use returns::{ReturnScale, lambda_returns, replayed_returns};
+
+use super::{Agent, Losses, Mode, Seat};
+use crate::env::Spec;
+use crate::error::{Error, Result};
+use crate::model::{Latent, WorldModel, WorldModelConfig};
+use crate::nn::{Adam, AdamConfig, Parameters, Weights, ops, parameters_of_fields, tensor};
+use crate::plan::noise::ColoredNoise;
+use crate::plan::{ControlConfig, PlannerConfig, RecedingHorizon};
+use crate::replay::{SequenceReplay, Sequences, Transition};
+use crate::rng::{self, Rng};
+
+/// Each update is cut into so many parts, which learn side by side. A fixed number: results do not depend on the machine.
+const PARTS: usize = 2;
+
+/// Settings of [`Dreamer`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DreamerConfig {
+    /// The world model.
+    pub world: WorldModelConfig,
+    /// Actor and critic.
+    pub behaviour: ActorCriticConfig,
+    /// Plans in the latent world instead of asking the policy, if there is a planner.
+    pub planner: Option<PlannerConfig>,
+    /// How plans become control.
+    pub control: ControlConfig,
+    /// Step size of everything.
+    pub learning_rate: f32,
+    /// Updates over which the step size grows to that.
+    pub learning_warm_up: u32,
+    /// Stretches of experience in an update.
+    pub batch: usize,
+    /// Moments in each.
+    pub length: usize,
+    /// Moments that are learned from for each moment that is lived through.
+    pub train_ratio: f32,
+    /// Random steps before the first update.
+    pub warm_up: usize,
+    /// Exponent of the noise of which random actions are made: 0 is white.
+    pub warm_up_colour: f64,
+    /// Moments remembered.
+    pub replay: usize,
+}
+
+impl Default for DreamerConfig {
+    /// The smallest published size, `size1m`, as it is run on state observations.
+    fn default() -> Self {
+        Self {
+            world: WorldModelConfig::default(),
+            behaviour: ActorCriticConfig::default(),
+            planner: None,
+            control: ControlConfig::default(),
+            learning_rate: 4e-5,
+            learning_warm_up: 1000,
+            batch: 16,
+            length: 64,
+            train_ratio: 1024.0,
+            warm_up: 1024,
+            warm_up_colour: 0.0,
+            replay: 1_000_000,
+        }
+    }
+}
+
+impl DreamerConfig {
+    fn check(&self) -> Result<()> {
+        self.world.check()?;
+        self.behaviour.check()?;
+        if let Some(planner) = &self.planner {
+            self.control.check(planner)?;
+        }
+        if !self.batch.is_multiple_of(PARTS) || self.batch == 0 || self.length < 2 {
+            return Err(Error::BadSetting(format!(
+                "dreamer: `batch` must be a multiple of {PARTS}, `length` at least 2"
+            )));
+        }
+        if self.warm_up <= self.length || self.train_ratio <= 0.0 {
+            return Err(Error::BadSetting(
+                "dreamer: `warm_up` must be more than `length`, `train_ratio` more than 0".into(),
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// All that learns; and the slow critic, which follows.
+struct Networks {
+    world: WorldModel,
+    behaviour: ActorCritic,
+    slow: SlowCritic,
+}
+
+parameters_of_fields!(Networks: world, behaviour);
+
+/// World model, actor and critic, and the experience that they learn from.
+pub struct Dreamer {
+    config: DreamerConfig,
+    actions: usize,
+    horizon: usize,
+    networks: Networks,
+    optimiser: Adam,
+    scale: ReturnScale,
+    replay: SequenceReplay,
+    observed: usize,
+    /// Updates that are owed for what was lived through.
+    owed: f32,
+    random: Vec<f32>,
+    /// Acts where it learns.
+    mind: Mind,
+    /// Act where it is judged, one for each seat.
+    seats: Vec<Mind>,
+    rng: Rng,
+}
+
+/// What is believed in one world, and what was done there last.
+struct Mind {
+    belief: Latent,
+    action: Vec<f32>,
+    control: Option<RecedingHorizon>,
+    rng: Rng,
+}
+
+/// What a part of an update has found out.
+struct Part {
+    gradients: Gradients<f32, Cpu>,
+    losses: Losses,
+    dream: Dream,
+}
+
+impl Dreamer {
+    /// A fresh agent for an environment.
+    ///
+    /// # Errors
+    /// If a setting cannot be used.
+    pub fn new(spec: &Spec, config: DreamerConfig, seed: u64) -> Result<Self> {
+        config.check()?;
+        let mut rng = rng::stream(seed, "dreamer");
+        let world = WorldModel::new(spec, &config.world, &mut rng);
+        let (behaviour, slow) = ActorCritic::new(&world, spec.action_size, &config.behaviour, &mut rng);
+        let optimiser = AdamConfig { warm_up: config.learning_warm_up, ..AdamConfig::laprop(config.learning_rate) };
+        let mut agent = Self {
+            actions: spec.action_size,
+            horizon: spec.horizon,
+            mind: Mind::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
+            networks: Networks { world, behaviour, slow },
+            optimiser: Adam::new(optimiser),
+            scale: ReturnScale::default(),
+            replay: SequenceReplay::new(spec.observation_size(), spec.action_size, config.replay),
+            observed: 0,
+            owed: 0.0,
+            random: Vec::new(),
+            seats: Vec::new(),
+            rng,
+            config,
+        };
+        agent.mind.forget(&agent.networks.world);
+        Ok(agent)
+    }
+
+    /// The model of the world.
+    pub fn world(&self) -> &WorldModel {
+        &self.networks.world
+    }
+
+    /// Actor and critic.
+    pub fn behaviour(&self) -> &ActorCritic {
+        &self.networks.behaviour
+    }
+
+    /// One update of everything, on stretches of experience drawn anew.
+    pub fn learn(&mut self) -> Losses {
+        let DreamerConfig { batch, length, .. } = self.config;
+        let shares: Vec<(Sequences, Rng)> = (0..PARTS)
+            .map(|_| (self.replay.sample(batch / PARTS, length, &mut self.rng), rng::fork(&mut self.rng)))
+            .collect();
+        let networks = &self.networks;
+        let parts: Vec<Part> = shares.into_par_iter().map(|(batch, rng)| networks.study(&batch, rng)).collect();
+        let mut returns: Vec<f32> = parts.iter().flat_map(|part| part.dream.returns.concat()).collect();
+        self.scale.update(&mut returns);
+        let scale = self.scale.scale();
+        let parts: Vec<Part> = parts.into_par_iter().map(|part| networks.practise(part, scale)).collect();
+
+        let mut losses = Losses::new();
+        let mut gradients = Gradients::leaky();
+        for mut part in parts {
+            for (name, value) in part.losses {
+                *losses.entry(name).or_default() += value / PARTS as f32;
+            }
+            for (_, parameter) in self.networks.parameters() {
+                let own = std::mem::take(&mut **part.gradients.get_or_alloc_mut(parameter).expect("memory"));
+                let sum = gradients.get_or_alloc_mut(parameter).expect("memory");
+                sum.iter_mut().zip(own).for_each(|(sum, own)| *sum += own / PARTS as f32);
+            }
+        }
+        losses.insert("gradient", self.optimiser.step(&mut self.networks, &mut gradients));
+        losses.insert("return_scale", scale);
+        let Networks { behaviour, slow, .. } = &mut self.networks;
+        behaviour.guide(slow);
+        losses
+    }
+
+    /// The next number of coloured noise for each number of an action.
+    fn explore(&mut self) -> Vec<f32> {
+        if self.random.is_empty() {
+            let noise = ColoredNoise::new(self.config.warm_up_colour, self.horizon.max(2));
+            let actions = noise.sample_actions(self.actions, &mut self.rng);
+            self.random = actions.iter().map(|a| a.clamp(-1.0, 1.0) as f32).collect();
+        }
+        self.random.drain(..self.actions).collect()
+    }
+}
+
+impl Networks {
+    /// The first half of a part of an update: the world model's losses, and dreams of where its beliefs may lead.
+    fn study(&self, batch: &Sequences, mut rng: Rng) -> Part {
+        let Self { world, behaviour, slow } = self;
+        let mut tape = OwnedTape::default();
+        let lesson = world.lesson(&mut tape, batch, &mut rng);
+        let dream = behaviour.dream(world, &lesson.latent, &mut rng);
+        let replayed = behaviour.replayed_loss(&mut tape, world, slow, batch, &lesson, &dream.returns[0]);
+        let mean = |loss: &crate::nn::Tensor3| {
+            let numbers = crate::nn::values(loss);
+            numbers.iter().sum::<f32>() / numbers.len() as f32
+        };
+        let mut losses: Losses = lesson.losses.iter().map(|(name, _, loss)| (*name, mean(loss))).collect();
+        losses.insert("replayed_value", mean(&replayed.1));
+        losses.insert("posterior_entropy", lesson.entropies[0]);
+        losses.insert("prior_entropy", lesson.entropies[1]);
+        let mut all: Vec<_> = lesson.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
+        all.push(replayed);
+        Part { gradients: ops::total(tape, &all).backward(), losses, dream }
+    }
+
+    /// The second half: actor and critic learn from the dreams.
+    fn practise(&self, part: Part, scale: f32) -> Part {
+        let Part { gradients, mut losses, dream } = part;
+        let Self { world, behaviour, slow } = self;
+        // Onto the gradients that are there already.
+        let (_, mut tape) = dream.features[0].clone().traced(gradients).split_tape();
+        let (all, report) = behaviour.losses(&mut tape, world, slow, &dream, scale);
+        losses.extend(report);
+        Part { gradients: ops::total(tape, &all).backward(), losses, dream }
+    }
+}
+
+impl Mind {
+    fn new(world: &WorldModel, config: &DreamerConfig, actions: usize, rng: Rng) -> Self {
+        let control = config.planner.as_ref().map(|planner| RecedingHorizon::new(planner, actions, &config.control));
+        Self { belief: world.initial(1), action: vec![0.0; actions], control, rng }
+    }
+
+    /// A new episode begins.
+    fn forget(&mut self, world: &WorldModel) {
+        self.belief = world.initial(1);
+        self.action.fill(0.0);
+        if let Some(control) = &mut self.control {
+            control.reset();
+        }
+    }
+
+    /// Looks, and acts.
+    fn act(&mut self, networks: &Networks, obs: &[f32], mode: Mode) -> Vec<f32> {
+        let Networks { world, behaviour, .. } = networks;
+        let before = tensor(world.device(), self.action.clone(), (1, 1, self.action.len()));
+        self.belief = world.observe(&self.belief, &before, obs, &mut self.rng);
+        let action = match &mut self.control {
+            Some(control) => {
+                let rng = rng::fork(&mut self.rng);
+                let mut objective = Imagined { world, critic: behaviour, belief: &self.belief, rng };
+                control.act(&mut objective, &mut |_| {}, &mut self.rng)
+            }
+            None if mode == Mode::Explore => behaviour.sample(&self.belief.features(), &mut self.rng),
+            None => behaviour.best(&self.belief.features()),
+        };
+        self.action = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
+        self.action.clone()
+    }
+}
+
+impl Agent for Dreamer {
+    fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
+        if self.observed < self.config.warm_up && mode == Mode::Explore {
+            return self.explore();
+        }
+        self.mind.act(&self.networks, obs, mode)
+    }
+
+    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
+        let Self { seats: minds, config, networks, actions, .. } = self;
+        let fresh =
+            |number: usize| Mind::new(&networks.world, config, *actions, rng::stream(number as u64, "dreamer seat"));
+        for seat in seats {
+            while minds.len() <= seat.number {
+                minds.push(fresh(minds.len()));
+            }
+            if seat.first {
+                minds[seat.number] = fresh(seat.number);
+            }
+        }
+        let mut minds: Vec<Option<&mut Mind>> = minds.iter_mut().map(Some).collect();
+        let busy: Vec<(&Seat, &mut Mind)> =
+            seats.iter().map(|seat| (seat, minds[seat.number].take().expect("seats have different numbers"))).collect();
+        busy.into_par_iter().map(|(seat, mind)| mind.act(networks, seat.obs, Mode::Evaluate)).collect()
+    }
+
+    fn observe(&mut self, transition: &Transition) {
+        self.replay.push(transition);
+        self.observed += 1;
+        if transition.terminated || transition.truncated {
+            self.mind.forget(&self.networks.world);
+            self.random.clear();
+        }
+    }
+
+    fn update(&mut self) -> Option<Losses> {
+        if self.observed < self.config.warm_up {
+            return None;
+        }
+        self.owed += self.config.train_ratio / (self.config.batch * self.config.length) as f32;
+        let mut losses = None;
+        while self.owed >= 1.0 {
+            self.owed -= 1.0;
+            losses = Some(self.learn());
+        }
+        losses
+    }
+
+    fn weights(&self) -> Weights {
+        let mut weights = Weights::default();
+        weights.insert_module("dreamer", &self.networks);
+        weights
+    }
+
+    fn load_weights(&mut self, weights: &Weights) -> Result<()> {
+        weights.load_module("dreamer", &mut self.networks)
+    }
+
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        state.insert_module("slow", &self.networks.slow);
+        self.optimiser.save(&mut state, "optimiser");
+        self.replay.save(&mut state, "replay");
+        let [low, high] = self.scale.range();
+        state.insert("progress", vec![low, high, self.owed], [1, 1, 3]);
+        state.insert_counts("counts", &[self.observed as u64]);
+        state.insert_counts("rng", &rng::state(&self.rng));
+        state.insert_counts("mind rng", &rng::state(&self.mind.rng));
+        state
+    }
+
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        let counts = state.counts("counts", 1)?;
+        let (own, mind) = (state.counts("rng", 4)?, state.counts("mind rng", 4)?);
+        let &[low, high, owed] = state.get("progress", [1, 1, 3])? else { unreachable!("three numbers") };
+        state.load_module("slow", &mut self.networks.slow)?;
+        self.optimiser.load(state, "optimiser", &self.networks)?;
+        self.replay.load(state, "replay")?;
+        self.observed = counts[0] as usize;
+        self.scale = ReturnScale::from_range(low, high);
+        self.owed = owed;
+        self.rng = rng::from_state(&own);
+        self.mind = Mind::new(&self.networks.world, &self.config, self.actions, rng::from_state(&mind));
+        self.random.clear();
+        Ok(())
+    }
+}

@@ -1,0 +1,220 @@
+//! The recurrent state-space model of DreamerV3 (Hafner et al. 2023): a memory that is certain, and a state that is drawn.
+//!
+//! The memory h carries what has happened; from it the *prior* says what the next state z may be, before anything is seen.
+//! The *posterior* says it after a look at the observation. Imagination uses the prior, step after step, with its eyes
+//! closed.
+//!
+//! Layers, sizes and initialisation follow the reference implementation. Deviation: a stretch of experience starts with
+//! blank memory, where the reference stores its memory with the experience.
+
+use dfdx::prelude::*;
+use dfdx::tensor::Cpu;
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result};
+use crate::nn::norm::RmsNorm;
+use crate::nn::ops::{self, record};
+use crate::nn::recurrent::gru;
+use crate::nn::{
+    Activation, BlockDense, Categorical, Init, Learning, Mlp, MlpConfig, Norm, Tensor3, parameters_of_fields, tensor,
+    values,
+};
+use crate::rng::Rng;
+
+/// Sizes of an [`Rssm`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RssmConfig {
+    /// Numbers in the memory.
+    pub memory: usize,
+    /// Blocks of the memory's weights.
+    pub blocks: usize,
+    /// Width of the hidden layers.
+    pub hidden: usize,
+    /// Categorical distributions that make up the state.
+    pub categoricals: usize,
+    /// Classes of each.
+    pub classes: usize,
+    /// Share of the uniform distribution in each.
+    pub unimix: f32,
+}
+
+impl Default for RssmConfig {
+    /// The smallest published size, `size1m`.
+    fn default() -> Self {
+        Self { memory: 512, blocks: 8, hidden: 64, categoricals: 32, classes: 4, unimix: 0.01 }
+    }
+}
+
+impl RssmConfig {
+    /// # Errors
+    /// If the sizes do not fit together.
+    pub(crate) fn check(&self) -> Result<()> {
+        if self.blocks == 0 || !self.memory.is_multiple_of(self.blocks) || self.memory == 0 {
+            return Err(Error::BadSetting(format!(
+                "rssm: `memory` ({}) must be a multiple of `blocks` ({})",
+                self.memory, self.blocks
+            )));
+        }
+        if self.hidden == 0 || self.categoricals == 0 || self.classes < 2 || !(0.0..1.0).contains(&self.unimix) {
+            return Err(Error::BadSetting(
+                "rssm: `hidden` and `categoricals` must be at least 1, `classes` at least 2, `unimix` in [0, 1)".into(),
+            ));
+        }
+        Ok(())
+    }
+
+    /// Numbers in the state.
+    pub fn state(&self) -> usize {
+        self.categoricals * self.classes
+    }
+
+    /// Numbers that memory and state give to those who read them.
+    pub fn features(&self) -> usize {
+        self.memory + self.state()
+    }
+}
+
+/// What the model believes, for several worlds at once.
+#[derive(Clone, Debug)]
+pub struct Latent {
+    /// The memory h, `[1, rows, memory]`.
+    pub memory: Tensor3,
+    /// The state z, one-hot for each categorical, `[1, rows, categoricals x classes]`.
+    pub state: Tensor3,
+}
+
+impl Latent {
+    /// Memory and state side by side, `[1, rows, features]`: what all heads read.
+    pub fn features(&self) -> Tensor3 {
+        ops::join(self.memory.clone(), self.state.clone())
+    }
+
+    /// The same belief, forgotten where `keep` is 0.
+    pub fn masked<T: Tape<f32, Cpu>>(&self, tape: &mut T, keep: &[f32]) -> Self {
+        Self {
+            memory: record(tape, &self.memory, |memory| ops::scale_rows(memory, keep)),
+            state: record(tape, &self.state, |state| ops::scale_rows(state, keep)),
+        }
+    }
+
+    /// The belief of one row, `times` times.
+    pub fn repeated(&self, row: usize, times: usize) -> Self {
+        let repeat = |x: &Tensor3| {
+            let width = x.shape().2;
+            tensor(x.device(), values(x)[row * width..][..width].repeat(times), (1, times, width))
+        };
+        Self { memory: repeat(&self.memory), state: repeat(&self.state) }
+    }
+}
+
+/// The model.
+#[derive(Clone, Debug)]
+pub struct Rssm {
+    config: RssmConfig,
+    cpu: Cpu,
+    from_memory: Mlp,
+    from_state: Mlp,
+    from_action: Mlp,
+    mix: BlockDense,
+    mix_norm: RmsNorm,
+    gates: BlockDense,
+    prior: Mlp,
+    posterior: Mlp,
+}
+
+parameters_of_fields!(Rssm: from_memory, from_state, from_action, mix, mix_norm, gates, prior, posterior);
+
+impl Rssm {
+    /// A new model of worlds with so many numbers in an action, for tokens (encoded observations) of so many numbers.
+    pub fn new(cpu: &Cpu, config: &RssmConfig, actions: usize, token: usize, rng: &mut Rng) -> Self {
+        let RssmConfig { memory, blocks, hidden, .. } = *config;
+        let state = config.state();
+        let mut mlp = |input, layers: usize, output| layers_of(cpu, input, &vec![hidden; layers], output, rng);
+        let (from_memory, from_state) = (mlp(memory, 1, None), mlp(state, 1, None));
+        let from_action = mlp(actions, 1, None);
+        let (prior, posterior) = (mlp(memory, 2, Some(state)), mlp(memory + token, 1, Some(state)));
+        Self {
+            mix: BlockDense::new(cpu, blocks, memory, 3 * hidden, memory, rng),
+            mix_norm: RmsNorm::new(cpu, memory),
+            gates: BlockDense::new(cpu, blocks, memory, 0, 3 * memory, rng),
+            config: config.clone(),
+            cpu: cpu.clone(),
+            from_memory,
+            from_state,
+            from_action,
+            prior,
+            posterior,
+        }
+    }
+
+    /// The distributions that a state is drawn from.
+    pub fn categorical(&self) -> Categorical {
+        let RssmConfig { categoricals: count, classes, unimix, .. } = self.config;
+        Categorical { count, classes, unimix }
+    }
+
+    /// What is believed before anything has happened: nothing.
+    pub fn initial(&self, rows: usize) -> Latent {
+        let zeros = |width: usize| tensor(&self.cpu, vec![0.0; rows * width], (1, rows, width));
+        Latent { memory: zeros(self.config.memory), state: zeros(self.config.state()) }
+    }
+
+    /// One step with open eyes: what is believed after `action` (`[1, rows, actions]`, each in [-1, 1]) has led to what is
+    /// now seen, `token` (`[1, rows, token]`). Also the logits that the state was drawn from.
+    pub fn observe<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        before: &Latent,
+        action: &Tensor3,
+        token: &Tensor3,
+        rng: &mut Rng,
+    ) -> (Latent, Tensor3) {
+        let memory = self.remember(tape, before, action);
+        let seen = record(tape, &memory, |memory| ops::join(memory, token.clone()));
+        let logits = record(tape, &seen, |seen| self.posterior.forward(seen, Learning::Trained));
+        let state = record(tape, &logits, |logits| self.categorical().sample(logits, rng));
+        (Latent { memory, state }, logits)
+    }
+
+    /// One step with closed eyes: what is believed to come of `action`.
+    pub fn imagine<T: Tape<f32, Cpu>>(&self, tape: &mut T, before: &Latent, action: &Tensor3, rng: &mut Rng) -> Latent {
+        let memory = self.remember(tape, before, action);
+        let logits = self.expect(tape, &memory);
+        let state = record(tape, &logits, |logits| self.categorical().sample(logits, rng));
+        Latent { memory, state }
+    }
+
+    /// The prior's logits for the states that may come with these memories.
+    pub fn expect<T: Tape<f32, Cpu>>(&self, tape: &mut T, memory: &Tensor3) -> Tensor3 {
+        record(tape, memory, |memory| self.prior.forward(memory, Learning::Trained))
+    }
+
+    /// The memory after an action.
+    fn remember<T: Tape<f32, Cpu>>(&self, tape: &mut T, before: &Latent, action: &Tensor3) -> Tensor3 {
+        let memory = record(tape, &before.memory, |memory| self.from_memory.forward(memory, Learning::Trained));
+        let state = record(tape, &before.state, |state| self.from_state.forward(state, Learning::Trained));
+        let action = record(tape, action, |action| self.from_action.forward(action, Learning::FromData));
+        let happened = record(tape, &memory, |memory| ops::join(memory, state));
+        let happened = record(tape, &happened, |happened| ops::join(happened, action));
+        let mixed = record(tape, &before.memory, |memory| self.mix.forward(memory, Some(&happened)));
+        let mixed = record(tape, &mixed, |mixed| self.mix_norm.forward(mixed));
+        let gates = record(tape, &mixed, |mixed| self.gates.forward(mixed, None));
+        record(tape, &gates, |gates| gru(gates, &before.memory, self.config.blocks))
+    }
+}
+
+/// A network in DreamerV3's manner: layers normalised by their root mean square, SiLU, and perhaps an affine layer at the
+/// end.
+pub fn layers_of(cpu: &Cpu, input: usize, hidden: &[usize], output: Option<usize>, rng: &mut Rng) -> Mlp {
+    let config = MlpConfig {
+        members: 1,
+        input,
+        hidden: hidden.to_vec(),
+        output,
+        norm: Norm::Rms,
+        activation: Activation::Silu,
+        init: Init::Lecun,
+    };
+    Mlp::new(cpu, &config, rng)
+}

@@ -1,0 +1,154 @@
+//! Numbers of any size as distributions over bins (DreamerV3): what is learned is a classification, whose gradients do
+//! not grow with the numbers.
+
+use dfdx::prelude::*;
+use dfdx::tensor::Cpu;
+
+use super::categorical::softmax;
+use super::ops::{self, Tensor3, values};
+
+/// `sign(x) ln(1 + |x|)`: large numbers, tamed.
+pub fn symlog(x: f32) -> f32 {
+    x.signum() * x.abs().ln_1p()
+}
+
+/// The inverse of [`symlog`].
+pub fn symexp(x: f32) -> f32 {
+    x.signum() * x.abs().exp_m1()
+}
+
+/// Bins that grow exponentially to both sides of zero.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SymexpBins {
+    bins: Vec<f32>,
+}
+
+impl SymexpBins {
+    /// `count` bins (odd, at least 3) from `-symexp(limit)` to `symexp(limit)`; the middle one is exactly zero.
+    ///
+    /// # Panics
+    /// If the count is even or below 3.
+    pub fn new(count: usize, limit: f64) -> Self {
+        assert!(count >= 3 && count % 2 == 1, "an odd number of bins");
+        let half = count / 2;
+        let upper = |i: usize| (limit * i as f64 / half as f64).exp_m1() as f32;
+        Self { bins: (0..count).map(|i| if i < half { -upper(half - i) } else { upper(i - half) }).collect() }
+    }
+
+    /// How many bins there are.
+    pub fn count(&self) -> usize {
+        self.bins.len()
+    }
+
+    /// Where `y` lies: a bin, and the weights of it and of the next one, linear between the two. Beyond the last bins, all
+    /// weight is on them.
+    pub fn encode(&self, y: f32) -> (usize, [f32; 2]) {
+        let last = self.bins.len() - 1;
+        let y = y.clamp(self.bins[0], self.bins[last]);
+        let lower = (self.bins.partition_point(|bin| *bin <= y).max(1) - 1).min(last - 1);
+        let upper = (y - self.bins[lower]) / (self.bins[lower + 1] - self.bins[lower]);
+        (lower, [1.0 - upper, upper])
+    }
+
+    /// The number that a row of probabilities stands for: the expected bin. Summed in pairs from both sides, so that even
+    /// probabilities give exactly zero, which the sum from left to right loses among numbers of 1e8.
+    fn expected(&self, probabilities: &[f32]) -> f32 {
+        let half = self.bins.len() / 2;
+        let (left, right) = probabilities.split_at(half);
+        let pairs = left.iter().rev().zip(&right[1..]).zip(&self.bins[half + 1..]);
+        pairs.map(|((minus, plus), bin)| (plus - minus) * bin).sum()
+    }
+
+    /// The number that each row of logits stands for.
+    pub fn read(&self, logits: &Tensor3) -> Vec<f32> {
+        let mut probabilities = values(logits).to_vec();
+        softmax(&mut probabilities, self.bins.len());
+        probabilities.chunks_exact(self.bins.len()).map(|row| self.expected(row)).collect()
+    }
+
+    /// The cross-entropy between each row of logits and the sum of the two-hot codes of that row's targets, `[1, batch, 1]`.
+    ///
+    /// # Panics
+    /// If there is not one list of targets as long as the batch for each.
+    pub fn loss<T: Tape<f32, Cpu>>(&self, logits: Tensor3<T>, targets: &[&[f32]]) -> Tensor3<T> {
+        let &(_, batch, width) = logits.shape();
+        assert_eq!(width, self.bins.len(), "a logit for each bin");
+        assert!(targets.iter().all(|each| each.len() == batch), "targets for each row");
+        ops::rowwise(logits, |row, logits, slope| {
+            // -sum t ln softmax(l), with slope sum(t) softmax(l) - t.
+            slope.copy_from_slice(logits);
+            softmax(slope, width);
+            // The softmax is exp(l - normaliser); read it off where it is largest.
+            let (likeliest, share) =
+                slope.iter().enumerate().fold((0, 0.0), |best, (i, p)| if *p > best.1 { (i, *p) } else { best });
+            let normaliser = logits[likeliest] - share.ln();
+            slope.iter_mut().for_each(|p| *p *= targets.len() as f32);
+            let mut loss = 0.0;
+            for target in targets {
+                let (lower, weights) = self.encode(target[row]);
+                for (i, weight) in weights.into_iter().enumerate() {
+                    slope[lower + i] -= weight;
+                    loss += weight * (normaliser - logits[lower + i]);
+                }
+            }
+            loss
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::{device, tensor};
+
+    fn near(what: &str, found: f32, expected: f64, tolerance: f64) {
+        let error = (f64::from(found) - expected).abs();
+        assert!(error <= tolerance * expected.abs().max(1.0), "{what}: {found}, expected {expected}");
+    }
+
+    #[test]
+    fn symlog_and_back() {
+        let pairs = [(-1000.0, -6.908_754_78), (-0.1, -0.095_310_18), (0.0, 0.0), (3.0, 1.386_294_36)];
+        for (x, y) in pairs {
+            near("symlog", symlog(x), y, 1e-6);
+        }
+        for (y, x) in [(-5.0, -147.413_159_1), (0.25, 0.284_025_42), (7.0, 1_095.633_158_43)] {
+            near("symexp", symexp(y), x, 1e-6);
+        }
+    }
+
+    /// Numbers computed in float64 from the reference's formulas.
+    #[test]
+    fn two_hot_codes_are_the_references() {
+        let bins = SymexpBins::new(255, 20.0);
+        for (i, bin) in
+            [(0, -4.851_651_94e8), (100, -69.243_554), (127, 0.0), (128, 0.170_557_72), (254, 4.851_651_94e8)]
+        {
+            near("bin", bins.bins[i], bin, 1e-6);
+        }
+        for (y, lower, weight) in [
+            (0.0, 127, 1.0),
+            (0.1, 127, 0.413_688_21),
+            (1.5, 132, 0.193_445_89),
+            (-7.3, 113, 0.418_910_66),
+            (1234.5, 172, 0.805_610_6),
+            (-0.02, 126, 0.117_262_36),
+            (1e9, 253, 0.0),
+        ] {
+            let (found, [below, above]) = bins.encode(y);
+            assert_eq!(found, lower, "{y}");
+            near("weight", below, weight, 1e-4);
+            near("both", below + above, 1.0, 1e-6);
+        }
+        let cpu = device();
+        let blank = tensor(&cpu, vec![0.0; 255], (1, 1, 255));
+        assert_eq!(bins.read(&blank), [0.0]);
+        near("blank", values(&bins.loss(blank, &[&[3.0]]))[0], 5.541_263_55, 1e-6);
+        let logits: Vec<f32> = (0..255).map(|i| -0.5 * ((i as f32 - 130.0) / 3.0).powi(2)).collect();
+        let logits = tensor(&cpu, logits, (1, 1, 255));
+        near("read", bins.read(&logits)[0], 0.775_887_2, 1e-4);
+        for (y, loss) in [(1.5, 2.463_815_85), (0.0, 2.517_550_82), (-0.02, 2.563_152_85)] {
+            near("loss", values(&bins.loss(logits.clone(), &[&[y]]))[0], loss, 1e-5);
+        }
+    }
+}
