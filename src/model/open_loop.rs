@@ -43,8 +43,18 @@ pub struct OpenLoop {
     pub rmse_p90: f64,
 }
 
+/// Something that foresees what comes of actions.
+pub trait Foresee {
+    /// The numbers of an observation that it foresees, and by how much each typically changes in a step.
+    fn foreseen(&self) -> Vec<(usize, f32)>;
+
+    /// What may be observed after each of 0 to `ahead` steps, if from each start its episode's actions are repeated:
+    /// `[particles, starts, observation]` each. Of an episode it may look at all up to its start.
+    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
+}
+
 /// Judges a model on episodes that it has not learned from. Horizons longer than the episodes are left out.
-pub fn open_loop(dynamics: &Dynamics, traces: &[Trace], rng: &mut Rng) -> Vec<OpenLoop> {
+pub fn open_loop(model: &impl Foresee, traces: &[Trace], rng: &mut Rng) -> Vec<OpenLoop> {
     let longest = traces.iter().map(|trace| trace.actions.len()).max().unwrap_or(0);
     let horizons: Vec<usize> = HORIZONS.into_iter().filter(|k| *k <= longest).collect();
     let Some(&ahead) = horizons.last() else { return Vec::new() };
@@ -53,29 +63,44 @@ pub fn open_loop(dynamics: &Dynamics, traces: &[Trace], rng: &mut Rng) -> Vec<Op
         .flat_map(|trace| (0..(trace.actions.len() + 1).saturating_sub(ahead)).map(move |t| (trace, t)))
         .collect();
     let starts: Vec<(&Trace, usize)> = all.sample(rng, STARTS).copied().collect();
-    let obs: Vec<f32> = starts.iter().flat_map(|(trace, t)| trace.observations[*t].iter().copied()).collect();
-    let actions: Vec<f32> =
-        starts.iter().flat_map(|(trace, t)| trace.actions[*t..t + ahead].iter().flatten().copied()).collect();
-    let imagination = Imagination {
-        dynamics,
-        reward: Reward::Known(&Indifferent),
-        propagation: Propagation::TsInf,
-        particles: PARTICLES_PER_MEMBER * dynamics.members(),
-        value: None,
-    };
-    let (paths, _) = imagination.paths(&obs, &actions, ahead, rng);
-    horizons.into_iter().map(|k| judge(dynamics, &starts, &paths[k], k)).collect()
+    let futures = model.futures(&starts, ahead, rng);
+    let foreseen = model.foreseen();
+    horizons.into_iter().map(|k| judge(&foreseen, &starts, &futures[k], k)).collect()
+}
+
+/// The actions that follow a start.
+pub(crate) fn actions_from<'a>((trace, t): (&'a Trace, usize), ahead: usize) -> impl Iterator<Item = f32> + 'a {
+    trace.actions[t..t + ahead].iter().flatten().copied()
+}
+
+impl Foresee for Dynamics {
+    fn foreseen(&self) -> Vec<(usize, f32)> {
+        self.typical_changes().collect()
+    }
+
+    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        let obs: Vec<f32> = starts.iter().flat_map(|(trace, t)| trace.observations[*t].iter().copied()).collect();
+        let actions: Vec<f32> = starts.iter().flat_map(|start| actions_from(*start, ahead)).collect();
+        let imagination = Imagination {
+            dynamics: self,
+            reward: Reward::Known(&Indifferent),
+            propagation: Propagation::TsInf,
+            particles: PARTICLES_PER_MEMBER * self.members(),
+            value: None,
+        };
+        imagination.paths(&obs, &actions, ahead, rng).0
+    }
 }
 
 /// Judges the states after `k` steps, `[particles, starts, observation]`.
-fn judge(dynamics: &Dynamics, starts: &[(&Trace, usize)], states: &[f32], k: usize) -> OpenLoop {
-    let width = dynamics.observation_size();
+fn judge(foreseen: &[(usize, f32)], starts: &[(&Trace, usize)], states: &[f32], k: usize) -> OpenLoop {
+    let width = starts[0].0.observations[0].len();
     // What follows from other numbers is not judged twice.
     let mut squares = vec![0.0; starts.len()];
     let mut numbers = 0;
     let mut judged = Vec::new();
     let mut log_units = 0.0;
-    for (i, typical) in dynamics.typical_changes() {
+    for &(i, typical) in foreseen {
         let displacement = |(trace, t): &(&Trace, usize)| {
             f64::from(trace.observations[t + k][i]) - f64::from(trace.observations[*t][i])
         };

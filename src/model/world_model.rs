@@ -5,8 +5,9 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
+use super::open_loop::{Foresee, Trace, actions_from};
 use super::rssm::{Latent, Rssm, RssmConfig, layers_of};
-use crate::env::Spec;
+use crate::env::{Role, Spec};
 use crate::error::{Error, Result};
 use crate::nn::categorical::Side;
 use crate::nn::kernels::{sigmoid, softplus};
@@ -15,6 +16,11 @@ use crate::nn::two_hot::{symexp, symlog};
 use crate::nn::{Learning, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
 use crate::replay::Sequences;
 use crate::rng::Rng;
+
+/// Futures of each start when the model is judged.
+const PARTICLES: usize = 8;
+/// When it is judged, the model has looked at so many moments before it closes its eyes, if there were so many.
+const CONTEXT: usize = 16;
 
 /// Settings of a [`WorldModel`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -32,6 +38,8 @@ pub struct WorldModelConfig {
     pub bin_limit: f64,
     /// Nats by which the posterior may differ from the prior for nothing.
     pub free_nats: f32,
+    /// Weight of the loss that has the state tell what was observed. More than 1 buys precision in small things.
+    pub reconstruction: f32,
     /// Weight of the loss that teaches the prior what the posterior says.
     pub dynamics: f32,
     /// Weight of the loss that keeps the posterior predictable.
@@ -51,6 +59,7 @@ impl Default for WorldModelConfig {
             bins: 255,
             bin_limit: 20.0,
             free_nats: 1.0,
+            reconstruction: 1.0,
             dynamics: 1.0,
             representation: 0.1,
             discount_horizon: 333.0,
@@ -87,6 +96,8 @@ pub struct WorldModel {
     cpu: Cpu,
     centre: Vec<f32>,
     scale: Vec<f32>,
+    /// The numbers of an observation that have a course of their own.
+    lively: Vec<usize>,
     bins: SymexpBins,
     encoder: Mlp,
     rssm: Rssm,
@@ -124,6 +135,7 @@ impl WorldModel {
             rssm: Rssm::new(&cpu, &config.rssm, spec.action_size, config.units, rng),
             centre: spec.observation.iter().map(|feature| feature.centre).collect(),
             scale: spec.observation.iter().map(|feature| feature.scale).collect(),
+            lively: (0..spec.observation_size()).filter(|i| spec.observation[*i].role == Role::State).collect(),
             bins: SymexpBins::new(config.bins, config.bin_limit),
             config: config.clone(),
             cpu,
@@ -242,7 +254,7 @@ impl WorldModel {
         Lesson {
             entropies: [mean_entropy(&logits), mean_entropy(&expected)],
             losses: vec![
-                ("reconstruction", 1.0, reconstruction),
+                ("reconstruction", self.config.reconstruction, reconstruction),
                 ("reward", 1.0, reward),
                 ("continue", 1.0, continues),
                 ("dynamics", self.config.dynamics, dynamics),
@@ -292,5 +304,40 @@ impl WorldModel {
             stacked
         };
         (Latent { memory: stack(&memories), state: stack(&states) }, stack(&all_logits))
+    }
+}
+
+impl Foresee for WorldModel {
+    fn foreseen(&self) -> Vec<(usize, f32)> {
+        self.lively.iter().map(|&i| (i, 0.1 * self.scale[i])).collect()
+    }
+
+    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        // Each particle looks back on its own: what is believed is drawn too.
+        let rows: Vec<(&Trace, usize)> = starts.repeat(PARTICLES);
+        let width = starts[0].0.actions[0].len();
+        let mut latent = self.initial(rows.len());
+        for back in (0..CONTEXT).rev() {
+            // Those whose episode has not begun yet wait, and forget what they have seen while they did.
+            let begun = |t: usize| t.checked_sub(back);
+            let keep: Vec<f32> = rows.iter().map(|(_, t)| f32::from(begun(*t).is_some_and(|now| now > 0))).collect();
+            let before = latent.masked(&mut NoneTape, &keep);
+            let actions = rows.iter().flat_map(|(trace, t)| match begun(*t) {
+                Some(now) if now > 0 => trace.actions[now - 1].clone(),
+                _ => vec![0.0; width],
+            });
+            let actions = tensor(&self.cpu, actions.collect(), (1, rows.len(), width));
+            let obs: Vec<f32> =
+                rows.iter().flat_map(|(trace, t)| trace.observations[begun(*t).unwrap_or(0)].iter().copied()).collect();
+            latent = self.observe(&before, &actions, &obs, rng);
+        }
+        let actions: Vec<Vec<f32>> = rows.iter().map(|start| actions_from(*start, ahead).collect()).collect();
+        let mut futures = vec![self.decode(&latent.features())];
+        for k in 0..ahead {
+            let done = actions.iter().flat_map(|actions| &actions[k * width..][..width]).copied().collect();
+            latent = self.imagine(&latent, &tensor(&self.cpu, done, (1, rows.len(), width)), rng);
+            futures.push(self.decode(&latent.features()));
+        }
+        futures
     }
 }

@@ -9,7 +9,7 @@ mod planner;
 mod returns;
 
 use dfdx::prelude::*;
-use dfdx::tensor::{Cpu, Gradients};
+use dfdx::tensor::{Cpu, Gradients, Trace as _};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -20,6 +20,7 @@ pub use returns::{ReturnScale, lambda_returns, replayed_returns};
 use super::{Agent, Losses, Mode, Seat};
 use crate::env::Spec;
 use crate::error::{Error, Result};
+use crate::model::open_loop::{OpenLoop, Trace, open_loop};
 use crate::model::{Latent, WorldModel, WorldModelConfig};
 use crate::nn::{Adam, AdamConfig, Parameters, Weights, ops, parameters_of_fields, tensor};
 use crate::plan::noise::ColoredNoise;
@@ -341,6 +342,10 @@ impl Agent for Dreamer {
             losses = Some(self.learn());
         }
         losses
+    }
+
+    fn judge_model(&self, traces: &[Trace]) -> Vec<OpenLoop> {
+        open_loop(&self.networks.world, traces, &mut rng::stream(0, "open loop"))
     }
 
     fn weights(&self) -> Weights {
