@@ -8,13 +8,18 @@ use handful::replay::{ReplayBuffer, Transition};
 use handful::rng::{self, Rng};
 
 /// Two numbers: the first is moved by the action and by chance, the second turns with the first and is left alone by
-/// both.
+/// both. A third stands still, a fourth is the difference of the two.
 const CHANCE: f64 = 0.02;
 
 fn spec() -> Spec {
     Spec {
         name: "test".into(),
-        observation: vec![Feature::new("moved"), Feature::new("turned"), Feature::new("still")],
+        observation: vec![
+            Feature::new("moved"),
+            Feature::new("turned"),
+            Feature::new("still"),
+            Feature::new("apart").difference("turned", "moved"),
+        ],
         action_size: 1,
         horizon: 50,
         dt: 0.1,
@@ -26,10 +31,13 @@ fn expected(obs: &[f32], action: f32) -> [f32; 3] {
     [0.9 * obs[0] + 0.3 * action, obs[1] + 0.2 * (2.0 * obs[0]).sin(), obs[2]]
 }
 
+fn seen(moved: f32, turned: f32) -> Vec<f32> {
+    vec![moved, turned, 7.0, turned - moved]
+}
+
 fn step(obs: &[f32], action: f32, rng: &mut Rng) -> Vec<f32> {
-    let mut next = expected(obs, action);
-    next[0] += (CHANCE * rng::normal(rng)) as f32;
-    next.to_vec()
+    let [moved, turned, _] = expected(obs, action);
+    seen(moved + (CHANCE * rng::normal(rng)) as f32, turned)
 }
 
 struct Reach;
@@ -41,11 +49,11 @@ impl KnownReward for Reach {
 }
 
 fn experience(count: usize, rng: &mut Rng) -> (ReplayBuffer, Vec<Trace>) {
-    let mut data = ReplayBuffer::new(3, 1, count);
+    let mut data = ReplayBuffer::new(4, 1, count);
     let mut traces = Vec::new();
     while data.len() < count {
-        let mut obs = vec![rng::uniform(rng, -1.0, 1.0) as f32, rng::uniform(rng, -1.0, 1.0) as f32, 7.0];
-        let mut trace = Trace { observations: vec![obs.clone()], actions: Vec::new() };
+        let mut obs = seen(rng::uniform(rng, -1.0, 1.0) as f32, rng::uniform(rng, -1.0, 1.0) as f32);
+        let mut trace = Trace { observations: vec![obs.clone()], ..Trace::default() };
         for _ in 0..spec().horizon {
             let action = vec![rng::uniform(rng, -1.0, 1.0) as f32];
             let next_obs = step(&obs, action[0], rng);
@@ -82,7 +90,7 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
         let mut rng = rng::stream(1, "test");
         let mut judged = Vec::new();
         for _ in 0..500 {
-            let obs = [rng::uniform(&mut rng, -0.8, 0.8) as f32, rng::uniform(&mut rng, -0.8, 0.8) as f32, 7.0];
+            let obs = seen(rng::uniform(&mut rng, -0.8, 0.8) as f32, rng::uniform(&mut rng, -0.8, 0.8) as f32);
             let action = rng::uniform(&mut rng, -1.0, 1.0) as f32;
             let said = dynamics.predict(&obs, &[action]);
             let law = expected(&obs, action);
@@ -104,7 +112,7 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
 #[test]
 fn members_disagree_where_nothing_was_seen() {
     let dynamics = fitted(config()).dynamics();
-    let unsure = |x: f32| dynamics.predict(&[x, 0.0, 7.0], &[0.0]).epistemic[1].sqrt();
+    let unsure = |x: f32| dynamics.predict(&seen(x, 0.0), &[0.0]).epistemic[1].sqrt();
     assert!(unsure(6.0) > 5.0 * unsure(0.2), "{} far away, {} at home", unsure(6.0), unsure(0.2));
 }
 
@@ -118,7 +126,7 @@ fn the_best_members_predict_and_all_survive_a_save() {
     assert_eq!((errors.len(), ensemble.dynamics().members()), (4, 2));
     let mut copy = Ensemble::new(&spec(), config, &mut rng).expect("usable settings");
     copy.load_weights(&ensemble.weights()).expect("its own weights");
-    let (obs, action) = ([0.3, 0.1, 7.0], [0.4]);
+    let (obs, action) = (seen(0.3, 0.1), [0.4]);
     assert_eq!(copy.dynamics().predict(&obs, &action), ensemble.dynamics().predict(&obs, &action));
     let before = ensemble.dynamics().predict(&obs, &action);
     ensemble.fit(&data, &mut rng);
@@ -149,7 +157,7 @@ fn gradients_of_imagined_returns_are_exact() {
     let learned = fitted(EnsembleConfig { learn_reward: true, ..config() }).dynamics();
     assert!(learned.predicts_reward() && !known.predicts_reward());
     let actions: Vec<f32> = (0..12).map(|i| 0.8 * (i as f32).sin()).collect();
-    let obs = [0.2, -0.1, 7.0];
+    let obs = seen(0.2, -0.1);
     for (dynamics, reward) in [(&known, Reward::Known(&Reach)), (&learned, Reward::Learned)] {
         let model = Differentiable::new(dynamics);
         for caution in [0.0, 0.5] {
@@ -178,7 +186,7 @@ fn rewards_can_be_learned() {
     let returns = |reward| {
         let propagation = Propagation::Mean;
         let imagination = Imagination { dynamics: &dynamics, reward, propagation, particles: 5, value: None };
-        imagination.futures(&[0.1, 0.0, 7.0], &actions, 10, &mut rng::stream(3, "luck")).returns
+        imagination.futures(&seen(0.1, 0.0), &actions, 10, &mut rng::stream(3, "luck")).returns
     };
     let (known, learned) = (returns(Reward::Known(&Reach)), returns(Reward::Learned));
     for (known, learned) in known.iter().zip(&learned) {

@@ -56,6 +56,32 @@ pub struct Foreseen {
     pub disagreement: f32,
 }
 
+/// What an agent expected of a moment, and what came of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Expectation {
+    /// The value that it gave the moment: the discounted rewards from there on.
+    pub expected: f32,
+    /// The discounted rewards that came. What would come after an episode that the clock ended is taken from the value of
+    /// its last moment.
+    pub realised: f32,
+}
+
+impl Expectation {
+    /// Of each moment of an episode but the last, from the values of all its moments.
+    pub fn of_episode(values: &[f32], trace: &Trace, discount: f32) -> Vec<Self> {
+        let mut realised = if trace.terminated { 0.0 } else { *values.last().expect("a value for each moment") };
+        let moments = trace.rewards.iter().zip(values).rev();
+        let mut all: Vec<Self> = moments
+            .map(|(reward, expected)| {
+                realised = reward + discount * realised;
+                Self { expected: *expected, realised }
+            })
+            .collect();
+        all.reverse();
+        all
+    }
+}
+
 /// Something that acts and learns.
 pub trait Agent: Send {
     /// Chooses an action, each number in [-1, 1].
@@ -81,6 +107,11 @@ pub trait Agent: Send {
 
     /// How well its model foresees episodes that it has not learned from; nothing for agents without a model.
     fn judge_model(&self, _traces: &[Trace]) -> Vec<OpenLoop> {
+        Vec::new()
+    }
+
+    /// What it expects of each moment of episodes, beside what came; nothing for agents that expect nothing.
+    fn judge_values(&self, _traces: &[Trace]) -> Vec<Expectation> {
         Vec::new()
     }
 

@@ -9,12 +9,13 @@
 //! by the environment's own [`crate::env::Feature`]s.
 
 use dfdx::prelude::*;
-use dfdx::tensor::Cpu;
+use dfdx::tensor::{Cpu, Trace as _};
 use serde::{Deserialize, Serialize};
 
-use super::{Agent, Losses, Mode, Seat};
+use super::{Agent, Expectation, Losses, Mode, Seat};
 use crate::env::Spec;
 use crate::error::{Error, Result};
+use crate::model::open_loop::Trace;
 use crate::nn::ops;
 use crate::nn::{
     Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, Weights,
@@ -280,6 +281,18 @@ impl Agent for Sac {
         }
         // Inside the thread pool, or every parallel piece of an update would be handed over to it anew.
         rayon::scope(|_| (0..self.config.updates_per_step).map(|_| self.learn()).last())
+    }
+
+    fn judge_values(&self, traces: &[Trace]) -> Vec<Expectation> {
+        let of_episode = |trace: &Trace| {
+            let observations = trace.observations.concat();
+            let actions = self.modes(&observations).concat();
+            let actions = tensor(&self.cpu, actions, (1, trace.observations.len(), self.actions));
+            let q = self.critics.forward(ops::join(self.observations(&observations), actions), Learning::Frozen);
+            let values = q.min::<(usize, usize), Axis<0>>().as_vec();
+            Expectation::of_episode(&values, trace, self.config.discount)
+        };
+        traces.iter().flat_map(of_episode).collect()
     }
 
     fn weights(&self) -> Weights {

@@ -20,6 +20,8 @@ const STEP: f32 = 1e-3;
 pub struct Differentiable {
     cpu: Cpu,
     entry: Fixed,
+    /// What is read through a tanh: into it, and out of it.
+    near: Option<[Fixed; 2]>,
     networks: Mlp,
     exit: Fixed,
     members: usize,
@@ -56,10 +58,18 @@ impl Differentiable {
         let (width, actions, outputs) = (layout.width, dynamics.action_size(), dynamics.outputs());
         let members = dynamics.members();
 
-        let read = layout.inputs.iter().copied().chain(width..width + actions);
+        // What is read of the observation as it is, what through a tanh, and the action: columns of the networks' input.
+        let (plain, near) = (layout.inputs.len(), layout.near.len());
+        let read = layout.inputs.iter().copied().zip(0..).chain((width..width + actions).zip(plain + near..));
         let mut entry = vec![vec![0.0; inputs.mean.len()]; width + actions];
-        read.enumerate().for_each(|(column, row)| entry[row][column] = 1.0 / inputs.scale[column]);
+        read.for_each(|(row, column)| entry[row][column] = 1.0 / inputs.scale[column]);
         let shift: Vec<f32> = inputs.mean.iter().zip(&inputs.scale).map(|(mean, scale)| -mean / scale).collect();
+        let mut approach = vec![vec![0.0; near]; width + actions];
+        let mut close = vec![vec![0.0; inputs.mean.len()]; near];
+        for (j, (i, factor)) in layout.near.iter().enumerate() {
+            approach[*i][j] = *factor;
+            close[j][plain + j] = 1.0 / inputs.scale[plain + j];
+        }
 
         // From observation and normalised changes to the next observation, and the reward behind it.
         let rewarded = dynamics.predicts_reward().then_some(width);
@@ -77,6 +87,10 @@ impl Differentiable {
         }
         Self {
             entry: Fixed::new(&cpu, members, &entry, &shift),
+            near: (near > 0).then(|| {
+                let unshifted = vec![0.0; inputs.mean.len()];
+                [Fixed::new(&cpu, members, &approach, &vec![0.0; near]), Fixed::new(&cpu, members, &close, &unshifted)]
+            }),
             networks: dynamics.networks(&cpu),
             exit: Fixed::new(&cpu, members, &exit, &bias),
             members,
@@ -85,6 +99,14 @@ impl Differentiable {
             outputs,
             cpu,
         }
+    }
+
+    /// What the networks read of observations and actions side by side.
+    fn read<T: Tape<f32, Cpu>>(&self, input: Tensor3<T>) -> Tensor3<T> {
+        let Some([approach, close]) = &self.near else { return self.entry.forward(input) };
+        let (input, tape) = input.split_tape();
+        let (plain, tape) = self.entry.forward(input.clone().put_tape(tape)).split_tape();
+        close.forward(approach.forward(input.put_tape(tape)).tanh()) + plain
     }
 
     /// The returns of `actions` (`[candidates, horizon, action]`) from `obs`, and their gradients. A return is the mean
@@ -112,7 +134,7 @@ impl Differentiable {
         let mut rewards: Vec<Tensor3> = Vec::with_capacity(horizon);
         for action in &step_actions {
             let input = ops::join(state.clone().put_tape(tape), action.clone());
-            let head = self.networks.forward(self.entry.forward(input), Learning::Frozen);
+            let head = self.networks.forward(self.read(input), Learning::Frozen);
             let changes = head.slice((.., .., ..self.outputs));
             let (changes, so_far) = changes.split_tape();
             let (after, so_far) = self.exit.forward(ops::join(state.clone().put_tape(so_far), changes)).split_tape();

@@ -145,7 +145,7 @@ impl Dynamics {
                 &states[row * self.layout.width..][..self.layout.width],
                 &actions[row * self.actions..][..self.actions],
             );
-            let read = self.layout.inputs.iter().map(|i| state[*i]).chain(action.iter().copied());
+            let read = self.layout.read(state).chain(action.iter().copied());
             let features = self.inputs.mean.iter().zip(&self.inputs.scale);
             x.extend(read.zip(features).map(|(x, (mean, scale))| (x - mean) / scale));
         }

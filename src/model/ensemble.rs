@@ -158,7 +158,7 @@ impl Ensemble {
         config.check()?;
         let cpu = device();
         let (layout, actions) = (Layout::new(spec)?, spec.action_size);
-        let inputs = layout.inputs.len() + actions;
+        let inputs = layout.reads() + actions;
         let outputs = layout.predicted.len() + usize::from(config.learn_reward);
         let shape = MlpConfig {
             members: config.members,
@@ -260,14 +260,15 @@ impl Ensemble {
         let (mut inputs, mut targets) = (Vec::new(), Vec::new());
         for i in 0..data.len() {
             let row = data.row(i);
-            inputs.extend(self.layout.inputs.iter().map(|i| row.obs[*i]).chain(row.action.iter().copied()));
+            inputs.extend(self.layout.read(row.obs).chain(row.action.iter().copied()));
             targets.extend(self.layout.predicted.iter().map(|i| row.next_obs[*i] - row.obs[*i]));
             if self.config.learn_reward {
                 targets.push(row.reward);
             }
         }
         let still = |i: &usize| STILL * self.sizes[*i];
-        let of_inputs: Vec<f32> = self.layout.inputs.iter().map(still).chain(vec![STILL; self.actions]).collect();
+        let near = vec![STILL; self.layout.near.len() + self.actions];
+        let of_inputs: Vec<f32> = self.layout.inputs.iter().map(still).chain(near).collect();
         let of_targets: Vec<f32> =
             self.layout.predicted.iter().map(still).chain(self.config.learn_reward.then_some(STILL)).collect();
         self.inputs = Normaliser::fit(&inputs, &of_inputs);

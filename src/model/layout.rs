@@ -5,14 +5,21 @@
 
 use crate::env::{Role, Spec};
 use crate::error::{Error, Result};
+use crate::nn::kernels::tanh;
+
+/// What counts as near: a feature's scale divided by this.
+const NEAR: f32 = 4.0;
 
 /// Which numbers of an observation are which.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
     /// Numbers in an observation.
     pub width: usize,
     /// Those that networks read: what has a course of its own, and differences of such.
     pub inputs: Vec<usize>,
+    /// Those that networks read once more, through a tanh, each with the factor before it: the differences among them. Near
+    /// zero it shows as large what is small, and millimetres decide between a hand that touches and one that does not.
+    pub near: Vec<(usize, f32)>,
     /// Those that networks predict: what has a course of its own.
     pub predicted: Vec<usize>,
     /// Those that are the difference of two others: `[itself, minuend, subtrahend]`.
@@ -27,6 +34,7 @@ impl Layout {
     pub fn new(spec: &Spec) -> Result<Self> {
         let features = &spec.observation;
         let (mut inputs, mut predicted, mut differences) = (Vec::new(), Vec::new(), Vec::new());
+        let mut near = Vec::new();
         let find = |name: &str| {
             let known = features.iter().position(|f| f.name == name && !matches!(f.role, Role::Difference { .. }));
             known
@@ -44,6 +52,7 @@ impl Layout {
                     differences.push([i, a, b]);
                     if [a, b].iter().all(|part| features[*part].role == Role::State) {
                         inputs.push(i);
+                        near.push((i, NEAR / feature.scale));
                     }
                 }
             }
@@ -51,7 +60,18 @@ impl Layout {
         if predicted.is_empty() {
             return Err(Error::BadSetting(format!("{}: nothing in an observation has a course of its own", spec.name)));
         }
-        Ok(Self { width: features.len(), inputs, predicted, differences })
+        Ok(Self { width: features.len(), inputs, near, predicted, differences })
+    }
+
+    /// How many numbers networks read of an observation.
+    pub fn reads(&self) -> usize {
+        self.inputs.len() + self.near.len()
+    }
+
+    /// What networks read of an observation.
+    pub fn read<'a>(&'a self, obs: &'a [f32]) -> impl Iterator<Item = f32> + 'a {
+        let near = self.near.iter().map(|(i, factor)| tanh(factor * obs[*i]));
+        self.inputs.iter().map(|i| obs[*i]).chain(near)
     }
 
     /// Puts right, in an observation whose predicted numbers are new, what follows from them.

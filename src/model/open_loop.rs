@@ -25,6 +25,10 @@ pub struct Trace {
     pub observations: Vec<Vec<f32>>,
     /// Actions.
     pub actions: Vec<Vec<f32>>,
+    /// What each action brought.
+    pub rewards: Vec<f32>,
+    /// Whether the task itself ended with the last one.
+    pub terminated: bool,
 }
 
 /// How well a model foresees a number of steps.

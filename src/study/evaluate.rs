@@ -157,7 +157,7 @@ impl Judge {
         let blank = Episode { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
         let mut episodes = vec![blank; seeds.len()];
         let mut running: Vec<usize> = (0..seeds.len()).collect();
-        let starts = observations.iter().map(|obs| Trace { observations: vec![obs.clone()], actions: Vec::new() });
+        let starts = observations.iter().map(|obs| Trace { observations: vec![obs.clone()], ..Trace::default() });
         let mut traced: Vec<Trace> = starts.collect();
         let seat = Seat { number: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
         *action_ms = time_of_action(agent, seat);
@@ -181,6 +181,8 @@ impl Judge {
                 paths[i].extend(self.worlds.envs()[i].hand());
                 traced[i].observations.push(step.observation.clone());
                 traced[i].actions.extend(actions[i].clone());
+                traced[i].rewards.push(step.reward);
+                traced[i].terminated = step.terminated;
                 if step.done() {
                     running.retain(|&other| other != i);
                 }

@@ -168,27 +168,107 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
             lines.push((color, horizon, [band(&error), band(&coverage)]));
         }
     }
-    let steps = lines.iter().flat_map(|(_, _, bands)| bands[0].0.iter().copied());
-    let (first, last) = (steps.clone().fold(f64::INFINITY, f64::min), steps.fold(0.0, f64::max));
-    if lines.is_empty() {
+    let Some(worst) = lines.iter().flat_map(|(_, _, bands)| &bands[0].1).map(|[.., high]| *high).reduce(f64::max)
+    else {
+        return Ok(false);
+    };
+    let lines_of = |which: usize| {
+        let line = |(color, horizon, bands): &(RGBColor, u32, [Band; 2])| {
+            let label = format!("{horizon} step{} ahead", if *horizon == 1 { "" } else { "s" });
+            (*color, label, bands[which].clone())
+        };
+        lines.iter().map(line).collect()
+    };
+    let panels = [
+        Panel {
+            title: "error (1: as good as foreseeing no change)",
+            range: 0.0..worst.clamp(1.05, 4.0),
+            mark: Some(1.0),
+            percent: false,
+            lines: lines_of(0),
+            legend: SeriesLabelPosition::UpperRight,
+        },
+        Panel {
+            title: "truth inside the 90 % interval",
+            range: 0.0..1.03,
+            mark: Some(0.9),
+            percent: true,
+            lines: lines_of(1),
+            legend: SeriesLabelPosition::LowerRight,
+        },
+    ];
+    over_training(
+        path,
+        &format!("{task}: what the model of {method} foresees in episodes that it has not learned from"),
+        &panels,
+    )?;
+    Ok(true)
+}
+
+/// What a method's agent expects over training, beside what comes. False, and nothing drawn, if it expects nothing.
+///
+/// # Errors
+/// If the tables lack a column or the file cannot be written.
+pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<bool> {
+    let curves = |column: &str| tables.value_curves(task, method, column);
+    let (expected, realised, correlation) = (curves("expected")?, curves("realised")?, curves("correlation")?);
+    if expected.is_empty() {
         return Ok(false);
     }
-    let worst = lines.iter().flat_map(|(_, _, bands)| &bands[0].1).map(|[.., high]| *high).fold(1.05, f64::max);
+    let [expected, realised, correlation] = [expected, realised, correlation].map(|curves| band(&curves));
+    let all = expected.1.iter().chain(&realised.1).flatten().copied();
+    let (low, high) = (all.clone().fold(0.0, f64::min), all.fold(0.0, f64::max));
+    let panels = [
+        Panel {
+            title: "mean over all moments",
+            range: 1.05 * low..1.05 * high.max(low + 1e-3),
+            mark: None,
+            percent: false,
+            lines: vec![(PALETTE[0], "expected".into(), expected), (PALETTE[1], "came".into(), realised)],
+            legend: SeriesLabelPosition::LowerRight,
+        },
+        Panel {
+            title: "correlation of the two",
+            range: -0.3..1.03,
+            mark: Some(1.0),
+            percent: false,
+            lines: vec![(PALETTE[2], "over all moments".into(), correlation)],
+            legend: SeriesLabelPosition::LowerRight,
+        },
+    ];
+    over_training(path, &format!("{task}: discounted rewards that {method} expects, and those that come"), &panels)?;
+    Ok(true)
+}
+
+/// Steps, and the lowest, mean and highest value over the seeds at each.
+type Band = (Vec<f64>, Vec<[f64; 3]>);
+
+/// One of two charts side by side.
+struct Panel {
+    title: &'static str,
+    range: std::ops::Range<f64>,
+    /// A value to compare with.
+    mark: Option<f64>,
+    percent: bool,
+    lines: Vec<(RGBColor, String, Band)>,
+    legend: SeriesLabelPosition,
+}
+
+/// Draws what changes over training: the means over the seeds, two charts side by side.
+fn over_training(path: &Path, title: &str, panels: &[Panel; 2]) -> Result<()> {
+    let steps = panels.iter().flat_map(|panel| &panel.lines).flat_map(|(_, _, (steps, _))| steps.iter().copied());
+    let (first, last) = (steps.clone().fold(f64::INFINITY, f64::min), steps.fold(0.0, f64::max));
     draw(path, |area| {
-        let title = format!("{task}: what the model of {method} foresees in episodes that it has not learned from");
-        let area = area.margin(14, 10, 10, 10).titled(&title, (FONT, 20))?;
-        let panels = area.split_evenly((1, 2));
-        let about = [
-            ("error (1: as good as foreseeing no change)", worst.min(4.0), 1.0),
-            ("truth inside the 90 % interval", 1.03, 0.9),
-        ];
-        for (which, (panel, (title, top, mark))) in panels.iter().zip(about).enumerate() {
-            let mut chart = ChartBuilder::on(panel)
+        let area = area.margin(14, 10, 10, 10).titled(title, (FONT, 20))?;
+        for (area, Panel { title, range, mark, percent, lines, legend: position }) in
+            area.split_evenly((1, 2)).iter().zip(panels)
+        {
+            let mut chart = ChartBuilder::on(area)
                 .caption(title, (FONT, 15))
                 .margin(8)
                 .x_label_area_size(40)
                 .y_label_area_size(50)
-                .build_cartesian_2d(first.min(last - 1.0)..last, 0.0..top)?;
+                .build_cartesian_2d(first.min(last - 1.0)..last, range.clone())?;
             chart
                 .configure_mesh()
                 .light_line_style(WHITE)
@@ -197,27 +277,29 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
                 .x_desc("environment steps")
                 .x_labels(5)
                 .x_label_formatter(&|x| thousands(*x))
-                .y_label_formatter(&|y| if which == 1 { format!("{:.0} %", 100.0 * y) } else { format!("{y:.1}") })
+                .y_label_formatter(&|y| if *percent { format!("{:.0} %", 100.0 * y) } else { number(*y, range) })
                 .label_style((FONT, 14))
                 .draw()?;
-            chart.draw_series(DashedLineSeries::new([(first, mark), (last, mark)], 7, 5, GREY.stroke_width(1)))?;
-            for (color, horizon, bands) in &lines {
-                let (color, (x, y)) = (*color, &bands[which]);
-                let label = format!("{horizon} step{} ahead", if *horizon == 1 { "" } else { "s" });
+            if let Some(mark) = *mark {
+                chart.draw_series(DashedLineSeries::new([(first, mark), (last, mark)], 7, 5, GREY.stroke_width(1)))?;
+            }
+            for (color, label, (x, y)) in lines {
+                let color = *color;
+                let mean = x.iter().zip(y).map(|(x, [_, mean, _])| (*x, *mean));
                 chart
-                    .draw_series(LineSeries::new(
-                        x.iter().zip(y).map(|(x, [_, mean, _])| (*x, *mean)),
-                        color.stroke_width(3),
-                    ))?
+                    .draw_series(LineSeries::new(mean, color.stroke_width(3)))?
                     .label(label)
                     .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(3)));
             }
-            let position = if which == 0 { SeriesLabelPosition::UpperRight } else { SeriesLabelPosition::LowerRight };
-            legend(&mut chart, position)?;
+            legend(&mut chart, position.clone())?;
         }
         Ok(())
-    })?;
-    Ok(true)
+    })
+}
+
+/// With a decimal where the range is small.
+fn number(y: f64, range: &std::ops::Range<f64>) -> String {
+    if range.end - range.start < 10.0 { format!("{y:.1}") } else { format!("{y:.0}") }
 }
 
 type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
@@ -241,7 +323,7 @@ fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
 }
 
 /// Steps common to all seeds, with the lowest, mean and highest value at each.
-fn band(curves: &[(Vec<f64>, Vec<f64>)]) -> (Vec<f64>, Vec<[f64; 3]>) {
+fn band(curves: &[(Vec<f64>, Vec<f64>)]) -> Band {
     let shortest = curves.iter().min_by_key(|(x, _)| x.len()).expect("at least one curve");
     let rows = (0..shortest.0.len()).map(|i| {
         let values: Vec<f64> = curves.iter().map(|(_, y)| y[i]).collect();

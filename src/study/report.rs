@@ -19,11 +19,11 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     let mut tasks: Vec<&str> = pairs.iter().map(|(task, _)| task.as_str()).collect();
     tasks.dedup();
     let mut text = String::from("# Comparison\n\n");
-    text += "Every number here comes from `tests.csv`, `evaluations.csv`, `models.csv` and `summary.csv` beside this page. ";
+    text += "Every number here comes from `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` beside this page. ";
     text += "All methods are judged alike: the same tasks, observations and starts, deterministic actions, every ";
     text += "environment step counted, the random warm-up too. ";
     text += "Not alike is what they are told: `oracle` plans on the true simulator, `pets` in a learned model but with the ";
-    text += "known reward as a function of what is observed; `sac` has only the rewards that it receives.\n\n";
+    text += "known reward as a function of what is observed; `dreamer` and `sac` have only the rewards that they receive.\n\n";
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(
@@ -50,6 +50,11 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
                     "\n![Error and calibration of the model of {method} on {task} over environment steps]({file})\n"
                 )
                 .expect("text grows");
+            }
+            let file = format!("{task}-{method}-values.svg");
+            if figures::values(&tables, task, method, &to.join(&file))? {
+                write!(text, "\n![What {method} expects on {task} over environment steps, and what comes]({file})\n")
+                    .expect("text grows");
             }
         }
     }

@@ -1,8 +1,8 @@
 //! One run: an agent learns a task, is evaluated on the way and tested at the end; all of it in a
 //! folder that survives crashes and can be resumed.
 //!
-//! The folder holds `config.toml`, `episodes.csv`, `evaluations.csv`, `losses.csv`, `weights.safetensors`,
-//! at the end `test.csv`, and `checkpoint/state.safetensors`, the one file that a resumed run starts
+//! The folder holds `config.toml`, `episodes.csv`, `evaluations.csv`, `losses.csv`, `weights.safetensors`, of agents that
+//! foresee something `model.csv` and `values.csv`, at the end `test.csv`, and `checkpoint/state.safetensors`, the one file that a resumed run starts
 //! from. Every file is written under a temporary name and renamed.
 
 use std::collections::BTreeMap;
@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Judge, Starts, Summary};
-use crate::agent::{Agent, Mode};
+use super::statistics::{correlation, mean};
+use crate::agent::{Agent, Expectation, Mode};
 use crate::env::{Env, World};
 use crate::error::{Error, Result};
 use crate::files;
@@ -102,6 +103,37 @@ pub struct ModelRow {
     pub rmse_p90: f64,
 }
 
+/// A row of `values.csv`: what the agent expected of the last evaluation's episodes, and what came.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ValueRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// Mean of what it expected.
+    pub expected: f64,
+    /// Mean of what came.
+    pub realised: f64,
+    /// Root mean square of the difference.
+    pub rmse: f64,
+    /// Correlation of the two over all moments; 0 if one of them never changes.
+    pub correlation: f64,
+}
+
+impl ValueRow {
+    fn new(step: usize, moments: &[Expectation]) -> Option<Self> {
+        let expected: Vec<f64> = moments.iter().map(|moment| f64::from(moment.expected)).collect();
+        let realised: Vec<f64> = moments.iter().map(|moment| f64::from(moment.realised)).collect();
+        let square = |(e, r): (&f64, &f64)| (e - r).powi(2);
+        let squares: Vec<f64> = expected.iter().zip(&realised).map(square).collect();
+        (!moments.is_empty()).then(|| Self {
+            step,
+            expected: mean(&expected),
+            realised: mean(&realised),
+            rmse: mean(&squares).sqrt(),
+            correlation: correlation(&expected, &realised),
+        })
+    }
+}
+
 /// What a run has seen so far; the CSV files are this.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct Progress {
@@ -112,6 +144,8 @@ struct Progress {
     losses: Vec<LossRow>,
     #[serde(default)]
     model: Vec<ModelRow>,
+    #[serde(default)]
+    values: Vec<ValueRow>,
     /// Sum and count of each loss since the last row of it.
     pending: BTreeMap<String, (f32, usize)>,
 }
@@ -290,6 +324,7 @@ impl Run {
             coverage90,
             rmse_p90,
         }));
+        self.progress.values.extend(ValueRow::new(step, &self.agent.judge_values(&evaluation.traces)));
         self.evaluated_at = Some(self.progress.step);
         self.progress.evaluations.push(row.clone());
         Ok(Event::Evaluated(row))
@@ -324,9 +359,12 @@ impl Run {
             state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
             weights.write(&self.folder.join("weights.safetensors"))?;
         }
-        let Progress { episodes, evaluations, losses, model, .. } = &self.progress;
+        let Progress { episodes, evaluations, losses, model, values, .. } = &self.progress;
         if !model.is_empty() {
             write_csv(&self.folder.join("model.csv"), &MODEL_COLUMNS, model.iter())?;
+        }
+        if !values.is_empty() {
+            write_csv(&self.folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
         }
         write_csv(&self.folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
         write_csv(&self.folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations.iter())?;
@@ -338,6 +376,7 @@ const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "len
 const EVALUATION_COLUMNS: [&str; 8] =
     ["step", "episodes", "success", "return_mean", "return_std", "smoothness_sparc", "smoothness_ldlj", "action_ms"];
 const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90", "rmse_p90"];
+const VALUE_COLUMNS: [&str; 5] = ["step", "expected", "realised", "rmse", "correlation"];
 const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
 
 /// Whether the run in `folder` is complete.

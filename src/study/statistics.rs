@@ -35,6 +35,14 @@ pub fn deviation(values: &[f64]) -> f64 {
     (values.iter().map(|v| (v - centre).powi(2)).sum::<f64>() / values.len() as f64).sqrt()
 }
 
+/// The correlation of two lists; 0 if one of them never changes.
+pub fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let (centre_a, centre_b) = (mean(a), mean(b));
+    let products: Vec<f64> = a.iter().zip(b).map(|(a, b)| (a - centre_a) * (b - centre_b)).collect();
+    let spread = deviation(a) * deviation(b);
+    if spread > 0.0 { mean(&products) / spread } else { 0.0 }
+}
+
 /// A 95 % percentile-bootstrap interval of a statistic over runs.
 pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rng) -> [f64; 2] {
     const DRAWS: usize = 5000;

@@ -1,5 +1,5 @@
-//! From the folders of runs to the tables of a study: `evaluations.csv`, `models.csv` and `tests.csv` hold every
-//! run's numbers, `summary.csv` one row for each task and method. Figures and report are made from these
+//! From the folders of runs to the tables of a study: `evaluations.csv`, `models.csv`, `values.csv` and `tests.csv` hold
+//! every run's numbers, `summary.csv` one row for each task and method. Figures and report are made from these
 //! files alone.
 
 use std::path::Path;
@@ -22,6 +22,8 @@ pub struct Tables {
     pub evaluations: DataFrame,
     /// task, method, seed, step, horizon, rmse, ...: how well every learned model foresaw each evaluation.
     pub models: DataFrame,
+    /// task, method, seed, step, expected, realised, ...: what every agent expected of each evaluation, and what came.
+    pub values: DataFrame,
     /// task, method, seed, episode, return, success, ...: every test episode.
     pub tests: DataFrame,
     /// One row for each task and method.
@@ -34,7 +36,8 @@ impl Tables {
     /// # Errors
     /// If a run's files are missing or damaged.
     pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
-        let (mut evaluations, mut models, mut tests) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut evaluations, mut tests) = (Vec::new(), Vec::new());
+        let (mut models, mut values) = (Vec::new(), Vec::new());
         for folder in folders {
             let config = RunConfig::read(&folder.join("config.toml"))?;
             let labelled = |file: &str| -> Result<LazyFrame> {
@@ -50,8 +53,10 @@ impl Tables {
             if config.learns() {
                 evaluations.push(labelled("evaluations.csv")?);
             }
-            if folder.join("model.csv").exists() {
-                models.push(labelled("model.csv")?);
+            for (file, frames) in [("model.csv", &mut models), ("values.csv", &mut values)] {
+                if folder.join(file).exists() {
+                    frames.push(labelled(file)?);
+                }
             }
         }
         let join = |frames: Vec<LazyFrame>| {
@@ -60,9 +65,10 @@ impl Tables {
         };
         let evaluations = join(evaluations).map_err(inside)?;
         let models = join(models).map_err(inside)?;
+        let values = join(values).map_err(inside)?;
         let tests = join(tests).map_err(inside)?;
         let summary = summarise(&evaluations, &tests).map_err(inside)?;
-        Ok(Self { evaluations, models, tests, summary })
+        Ok(Self { evaluations, models, values, tests, summary })
     }
 
     /// Reads the tables of a study from its folder.
@@ -73,6 +79,7 @@ impl Tables {
         Ok(Self {
             evaluations: read(&folder.join("evaluations.csv"))?,
             models: read(&folder.join("models.csv"))?,
+            values: read(&folder.join("values.csv"))?,
             tests: read(&folder.join("tests.csv"))?,
             summary: read(&folder.join("summary.csv"))?,
         })
@@ -86,6 +93,7 @@ impl Tables {
         let tables = [
             ("evaluations.csv", &self.evaluations),
             ("models.csv", &self.models),
+            ("values.csv", &self.values),
             ("tests.csv", &self.tests),
             ("summary.csv", &self.summary),
         ];
@@ -133,6 +141,14 @@ impl Tables {
             curves(&rows, task, method, column)
         };
         found().map_err(inside)
+    }
+
+    /// A column of `values.csv` over steps: for each seed, steps and values. Empty for methods that expect nothing.
+    ///
+    /// # Errors
+    /// If the table lacks the column.
+    pub fn value_curves(&self, task: &str, method: &str, column: &str) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
+        curves(&self.values, task, method, column).map_err(inside)
     }
 
     /// A number of the summary, if it has one there.

@@ -17,7 +17,7 @@ pub use actor_critic::{ActorCritic, ActorCriticConfig, Dream, SlowCritic};
 pub use planner::Imagined;
 pub use returns::{ReturnScale, lambda_returns, replayed_returns};
 
-use super::{Agent, Losses, Mode, Seat};
+use super::{Agent, Expectation, Losses, Mode, Seat};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::open_loop::{OpenLoop, Trace, open_loop};
@@ -277,11 +277,16 @@ impl Mind {
         }
     }
 
+    /// Takes in what is to be seen.
+    fn look(&mut self, world: &WorldModel, obs: &[f32]) {
+        let before = tensor(world.device(), self.action.clone(), (1, 1, self.action.len()));
+        self.belief = world.observe(&self.belief, &before, obs, &mut self.rng);
+    }
+
     /// Looks, and acts.
     fn act(&mut self, networks: &Networks, obs: &[f32], mode: Mode) -> Vec<f32> {
         let Networks { world, behaviour, .. } = networks;
-        let before = tensor(world.device(), self.action.clone(), (1, 1, self.action.len()));
-        self.belief = world.observe(&self.belief, &before, obs, &mut self.rng);
+        self.look(world, obs);
         let action = match &mut self.control {
             Some(control) => {
                 let rng = rng::fork(&mut self.rng);
@@ -346,6 +351,24 @@ impl Agent for Dreamer {
 
     fn judge_model(&self, traces: &[Trace]) -> Vec<OpenLoop> {
         open_loop(&self.networks.world, traces, &mut rng::stream(0, "open loop"))
+    }
+
+    fn judge_values(&self, traces: &[Trace]) -> Vec<Expectation> {
+        let Self { networks: Networks { world, behaviour, .. }, config, actions, .. } = self;
+        let discount = config.world.discount();
+        let of_episode = |(i, trace): (usize, &Trace)| {
+            let mut mind = Mind::new(world, config, *actions, rng::stream(i as u64, "dreamer values"));
+            let values = trace.observations.iter().enumerate().map(|(t, obs)| {
+                mind.look(world, obs);
+                if let Some(action) = trace.actions.get(t) {
+                    mind.action.clone_from(action);
+                }
+                behaviour.values(world, &mind.belief.features())[0]
+            });
+            let values: Vec<f32> = values.collect();
+            Expectation::of_episode(&values, trace, discount)
+        };
+        traces.par_iter().enumerate().flat_map_iter(of_episode).collect()
     }
 
     fn weights(&self) -> Weights {
