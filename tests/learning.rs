@@ -8,7 +8,7 @@ use handful::env::{Env, Step, Task, World};
 use handful::error::Error;
 use handful::model::{EnsembleConfig, RssmConfig, WorldModelConfig};
 use handful::plan::{IcemConfig, PlannerConfig};
-use handful::replay::{ReplayBuffer, Transition};
+use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng;
 use handful::study::config::RunConfig;
 use handful::study::evaluate::{Judge, Starts};
@@ -153,6 +153,26 @@ fn the_replay_buffer_is_a_ring_and_keeps_truncated_futures() {
     }
 }
 
+#[test]
+fn pieces_of_episodes_keep_what_belongs_together() {
+    let mut buffer = SequenceReplay::new(2, 1, 1000);
+    (0..20).for_each(|i| buffer.push(&transition(i as f32, i % 5 == 4)));
+    assert_eq!(buffer.len(), 24, "each episode has one moment more than steps");
+    let batch = buffer.sample(100, 8, &mut rng::stream(0, "replay"));
+    for i in 0..700 {
+        let (obs, after) = (batch.obs[2 * i], i + 100);
+        assert_eq!(batch.last[i], batch.first[after], "what follows a last moment is a first one");
+        if !batch.last[i] {
+            assert_eq!(batch.obs[2 * after], obs + 1.0, "the next moment of the same episode");
+            assert_eq!(batch.rewards[after], obs, "the reward for arriving there");
+            assert_eq!(batch.actions[i], 0.5);
+        } else {
+            assert_eq!((batch.actions[i], batch.rewards[after], batch.terminal[i]), (0.0, 0.0, false));
+        }
+    }
+    assert!(batch.last.contains(&true));
+}
+
 /// SAC shrunk to seconds.
 fn debug_run(seed: u64) -> RunConfig {
     RunConfig::new(Task::Reach, "debug", seed, None, None).expect("a preset")
@@ -219,6 +239,11 @@ fn so_does_one_that_plans() {
 fn so_does_one_that_dreams() {
     let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"];
     ends_as_if_it_had_never_stopped(&small_dreamer(1), &files);
+    // And if it plans in its dreams.
+    let mut planning = small_dreamer(2);
+    let planner = IcemConfig { horizon: 4, population: 10, elites: 4, iterations: 2, ..IcemConfig::default() };
+    planning.dreamer.as_mut().expect("Dreamer's settings").planner = Some(PlannerConfig::Icem(planner));
+    ends_as_if_it_had_never_stopped(&planning, &files);
 }
 
 fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {

@@ -2,9 +2,13 @@
 
 use handful::env::{Feature, KnownReward, Spec};
 use handful::model::calibration::{Judged, coverage};
-use handful::model::open_loop::{Trace, open_loop};
-use handful::model::{Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward};
-use handful::replay::{ReplayBuffer, Transition};
+use handful::model::open_loop::{OpenLoop, Trace, open_loop};
+use handful::model::{
+    Autoencoder, AutoencoderConfig, Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward,
+    RssmConfig, WorldModel, WorldModelConfig,
+};
+use handful::nn::{Adam, AdamConfig, tensor};
+use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng::{self, Rng};
 
 /// Two numbers: the first is moved by the action and by chance, the second turns with the first and is left alone by
@@ -148,6 +152,72 @@ fn a_model_is_judged_over_many_steps() {
         assert!(row.rmse < 0.5, "better than foreseeing no change: {row:?}");
         assert!((0.75..=1.0).contains(&row.coverage90), "{row:?}");
     }
+}
+
+/// The same experience for models that read it in order.
+fn moments(traces: &[Trace]) -> SequenceReplay {
+    let mut moments = SequenceReplay::new(4, 1, 100_000);
+    for trace in traces {
+        for (t, action) in trace.actions.iter().enumerate() {
+            moments.push(&Transition {
+                obs: trace.observations[t].clone(),
+                action: action.clone(),
+                reward: Reach.reward(&trace.observations[t], action, &trace.observations[t + 1]),
+                next_obs: trace.observations[t + 1].clone(),
+                terminated: false,
+                truncated: t + 1 == trace.actions.len(),
+            });
+        }
+    }
+    moments
+}
+
+#[test]
+fn latent_models_foresee_too() {
+    let mut rng = rng::stream(6, "model");
+    let (_, traces) = experience(2000, &mut rng);
+    let (_, unseen) = experience(500, &mut rng);
+    let data = moments(&traces);
+    let better = |name: &str, judged: Vec<OpenLoop>| {
+        let five = judged.iter().find(|row| row.horizon == 5).expect("five steps");
+        assert!(five.rmse < 0.6, "{name}: better than foreseeing no change: {five:?}");
+    };
+
+    let config = AutoencoderConfig { code: 8, hidden: vec![32, 32] };
+    let mut autoencoder = Autoencoder::new(&spec(), &config, &mut rng);
+    let mut optimiser = Adam::new(AdamConfig::new(2e-3));
+    for _ in 0..600 {
+        autoencoder.learn(&data.sample(16, 8, &mut rng), &mut optimiser);
+    }
+    better("autoencoder", open_loop(&autoencoder, &unseen, &mut rng));
+
+    let rssm = RssmConfig { memory: 32, blocks: 2, hidden: 32, categoricals: 8, classes: 8, unimix: 0.01 };
+    let config =
+        WorldModelConfig { rssm, units: 32, layers: 2, bins: 41, bin_limit: 5.0, ..WorldModelConfig::default() };
+    let mut world = WorldModel::new(&spec(), &config, &mut rng);
+    let mut optimiser = Adam::new(AdamConfig { warm_up: 50, ..AdamConfig::laprop(1e-3) });
+    for _ in 0..800 {
+        world.learn(&data.sample(16, 16, &mut rng), &mut optimiser, &mut rng);
+    }
+    better("world model", open_loop(&world, &unseen, &mut rng));
+
+    // What it says of rewards, with open eyes.
+    let trace = &unseen[0];
+    let cpu = handful::nn::device();
+    let mut belief = world.initial(1);
+    let mut wrong = 0.0;
+    for (t, action) in trace.actions.iter().enumerate() {
+        let done = tensor(&cpu, action.clone(), (1, 1, 1));
+        if t == 0 {
+            belief = world.observe(&belief, &tensor(&cpu, vec![0.0], (1, 1, 1)), &trace.observations[0], &mut rng);
+        }
+        belief = world.observe(&belief, &done, &trace.observations[t + 1], &mut rng);
+        let told = world.rewards(&belief.features())[0];
+        let truth = Reach.reward(&trace.observations[t], action, &trace.observations[t + 1]);
+        wrong += (told - truth).abs() / trace.actions.len() as f32;
+    }
+    assert!(wrong < 0.15, "rewards between -3 and 0 are told to {wrong}");
+    assert!((world.continues(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
 }
 
 /// The tape's gradients against central differences, for known and for learned rewards.

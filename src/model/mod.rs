@@ -3,6 +3,7 @@
 //! [`Ensemble`] learns; its snapshot [`Dynamics`] predicts; [`Imagination`] lets a snapshot run ahead along many action
 //! sequences at once. [`uncertainty`] and [`calibration`] tell what the predictions are worth.
 
+mod autoencoder;
 pub mod calibration;
 mod differentiable;
 mod dynamics;
@@ -13,8 +14,10 @@ mod normaliser;
 pub mod open_loop;
 pub mod rssm;
 pub mod uncertainty;
+mod view;
 mod world_model;
 
+pub use autoencoder::{Autoencoder, AutoencoderConfig};
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit};

@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 
 use super::open_loop::{Foresee, Trace, actions_from};
 use super::rssm::{Latent, Rssm, RssmConfig, layers_of};
-use crate::env::{Role, Spec};
+use super::view::View;
+use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::categorical::Side;
 use crate::nn::kernels::{sigmoid, softplus};
-use crate::nn::ops::{self, record};
-use crate::nn::two_hot::{symexp, symlog};
-use crate::nn::{Learning, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
+use crate::nn::ops::{self, mean, record};
+use crate::nn::{Adam, Learning, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
 use crate::replay::Sequences;
 use crate::rng::Rng;
 
@@ -94,10 +94,7 @@ impl WorldModelConfig {
 pub struct WorldModel {
     config: WorldModelConfig,
     cpu: Cpu,
-    centre: Vec<f32>,
-    scale: Vec<f32>,
-    /// The numbers of an observation that have a course of their own.
-    lively: Vec<usize>,
+    view: View,
     bins: SymexpBins,
     encoder: Mlp,
     rssm: Rssm,
@@ -133,9 +130,7 @@ impl WorldModel {
         let continues = mlp(features, &hidden[..1], Some(1));
         Self {
             rssm: Rssm::new(&cpu, &config.rssm, spec.action_size, config.units, rng),
-            centre: spec.observation.iter().map(|feature| feature.centre).collect(),
-            scale: spec.observation.iter().map(|feature| feature.scale).collect(),
-            lively: (0..spec.observation_size()).filter(|i| spec.observation[*i].role == Role::State).collect(),
+            view: View::new(spec),
             bins: SymexpBins::new(config.bins, config.bin_limit),
             config: config.clone(),
             cpu,
@@ -161,18 +156,6 @@ impl WorldModel {
         &self.bins
     }
 
-    /// Observations as the networks see them: shifted and scaled by the world's own [`crate::env::Feature`]s, and large
-    /// numbers tamed. `[1, rows, observation]`.
-    pub fn seen(&self, obs: &[f32]) -> Tensor3 {
-        let size = self.centre.len();
-        let mut seen = Vec::with_capacity(obs.len());
-        for row in obs.chunks_exact(size) {
-            let features = row.iter().zip(self.centre.iter().zip(&self.scale));
-            seen.extend(features.map(|(x, (centre, scale))| symlog((x - centre) / scale)));
-        }
-        tensor(&self.cpu, seen, (1, obs.len() / size, size))
-    }
-
     /// What is believed before anything has been seen.
     pub fn initial(&self, rows: usize) -> Latent {
         self.rssm.initial(rows)
@@ -180,7 +163,7 @@ impl WorldModel {
 
     /// What is believed after `action` (`[1, rows, actions]`) has led to `obs`, in rows.
     pub fn observe(&self, before: &Latent, action: &Tensor3, obs: &[f32], rng: &mut Rng) -> Latent {
-        let token = self.encoder.forward(self.seen(obs), Learning::Frozen);
+        let token = self.encoder.forward(self.view.seen(&self.cpu, obs), Learning::Frozen);
         self.rssm.observe(&mut NoneTape, before, action, &token, rng).0
     }
 
@@ -191,13 +174,7 @@ impl WorldModel {
 
     /// The observations that go with features, in physical units, row by row.
     pub fn decode(&self, features: &Tensor3) -> Vec<f32> {
-        let told = self.decoder.forward(features.clone(), Learning::Frozen);
-        let mut obs = Vec::with_capacity(values(&told).len());
-        for row in values(&told).chunks_exact(self.centre.len()) {
-            let features = row.iter().zip(self.centre.iter().zip(&self.scale));
-            obs.extend(features.map(|(x, (centre, scale))| symexp(*x) * scale + centre));
-        }
-        obs
+        self.view.told(&self.decoder.forward(features.clone(), Learning::Frozen))
     }
 
     /// The rewards for having arrived where the features say.
@@ -213,24 +190,13 @@ impl WorldModel {
 
     /// How wrong the model is about a batch of experience; everything is recorded on `tape`.
     pub fn lesson<T: Tape<f32, Cpu>>(&self, tape: &mut T, batch: &Sequences, rng: &mut Rng) -> Lesson {
-        let seen = self.seen(&batch.obs);
+        let seen = self.view.seen(&self.cpu, &batch.obs);
         let (latent, logits) = self.follow(tape, batch, &seen, rng);
         let expected = self.rssm.expect(tape, &latent.memory);
         let features = record(tape, &latent.memory, |memory| ops::join(memory, latent.state.clone()));
 
         let told = record(tape, &features, |features| self.decoder.forward(features, Learning::Trained));
-        let width = self.centre.len();
-        let reconstruction = record(tape, &told, |told| {
-            ops::rowwise(told, |row, told, slope| {
-                let seen = &values(&seen)[row * width..][..width];
-                let mut loss = 0.0;
-                for ((slope, told), seen) in slope.iter_mut().zip(told).zip(seen) {
-                    *slope = 2.0 * (told - seen);
-                    loss += (told - seen) * (told - seen);
-                }
-                loss
-            })
-        });
+        let reconstruction = record(tape, &told, |told| ops::squared_distance(told, &seen));
         let reward = record(tape, &features, |features| {
             self.bins.loss(self.reward.forward(features, Learning::Trained), &[&batch.rewards])
         });
@@ -263,6 +229,16 @@ impl WorldModel {
             latent,
             features,
         }
+    }
+
+    /// One step of learning by itself, without actor and critic. Returns the mean of each loss.
+    pub fn learn(&mut self, batch: &Sequences, optimiser: &mut Adam, rng: &mut Rng) -> Vec<(&'static str, f32)> {
+        let mut tape = OwnedTape::default();
+        let lesson = self.lesson(&mut tape, batch, rng);
+        let means = lesson.losses.iter().map(|(name, _, loss)| (*name, mean(loss))).collect();
+        let losses: Vec<_> = lesson.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
+        optimiser.step(self, &mut ops::total(tape, &losses).backward());
+        means
     }
 
     /// What is believed at each moment of a batch, moments one after the other, and the posterior's logits.
@@ -309,7 +285,7 @@ impl WorldModel {
 
 impl Foresee for WorldModel {
     fn foreseen(&self) -> Vec<(usize, f32)> {
-        self.lively.iter().map(|&i| (i, 0.1 * self.scale[i])).collect()
+        self.view.lively()
     }
 
     fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {

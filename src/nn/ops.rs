@@ -230,9 +230,25 @@ pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f
     y.put_tape(tape)
 }
 
+/// The squared distance of each row from the same row of `target`, `[members, batch, 1]`.
+pub fn squared_distance<T: Tape<f32, Cpu>>(x: Tensor3<T>, target: &Tensor3) -> Tensor3<T> {
+    assert_eq!(x.shape(), target.shape(), "a target for each number");
+    let (target, width) = (values(target), target.shape().2);
+    rowwise(x, |row, x, slope| {
+        let differences = x.iter().zip(&target[row * width..]).map(|(x, target)| x - target);
+        slope.iter_mut().zip(differences.clone()).for_each(|(slope, d)| *slope = 2.0 * d);
+        differences.map(|d| d * d).sum()
+    })
+}
+
+/// The mean over all numbers.
+pub fn mean(x: &Tensor3) -> f32 {
+    let numbers = values(x);
+    numbers.iter().sum::<f32>() / numbers.len() as f32
+}
+
 /// The sum of the means of several losses `[1, batch, 1]`, each times a weight: what is differentiated.
 pub fn total<T: Tape<f32, Cpu>>(mut tape: T, losses: &[(f32, Tensor3)]) -> Tensor<Rank0, f32, Cpu, T> {
-    let mean = |loss: &Tensor3| values(loss).iter().sum::<f32>() / loss.shape().1 as f32;
     let sum: f32 = losses.iter().map(|(weight, loss)| weight * mean(loss)).sum();
     let y = super::device().tensor(sum);
     if T::OWNS_TAPE {

@@ -14,13 +14,14 @@ use crate::env::{Env, Task, World};
 use crate::error::{Error, Result};
 
 /// The presets that come with the crate: the methods that the command line knows. A preset's table
-/// `for.TASK` holds what differs for that task.
-const PRESETS: [(&str, &str); 8] = [
+/// `for.TASK` holds what differs for that task; `base` names a preset that it differs from.
+const PRESETS: [(&str, &str); 9] = [
     ("random", include_str!("../../data/presets/random.toml")),
     ("scripted", include_str!("../../data/presets/scripted.toml")),
     ("oracle", include_str!("../../data/presets/oracle.toml")),
     ("pets", include_str!("../../data/presets/pets.toml")),
     ("dreamer", include_str!("../../data/presets/dreamer.toml")),
+    ("planet", include_str!("../../data/presets/planet.toml")),
     ("size1m", include_str!("../../data/presets/size1m.toml")),
     ("sac", include_str!("../../data/presets/sac.toml")),
     ("debug", include_str!("../../data/presets/debug.toml")),
@@ -108,12 +109,7 @@ impl RunConfig {
     /// # Errors
     /// If the method is unknown, the file cannot be read, or a field or value in it is wrong.
     pub fn new(task: Task, method: &str, seed: u64, steps: Option<usize>, file: Option<&Path>) -> Result<Self> {
-        let (_, preset) = PRESETS
-            .iter()
-            .find(|(name, _)| *name == method)
-            .ok_or_else(|| Error::unknown("method", method, methods()))?;
-        let mut table: Table = toml::from_str(preset).expect("our presets are TOML");
-        specialise(&mut table, task);
+        let mut table = preset(task, method)?;
         if let Some(path) = file {
             let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
             let mut changes: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
@@ -194,6 +190,18 @@ impl RunConfig {
             AgentKind::Sac => Box::new(Sac::new(world.spec(), self.sac.clone().unwrap_or_default(), self.seed)?),
         })
     }
+}
+
+/// The settings of a method for a task: its preset's, over those of the preset that it names as its `base`.
+fn preset(task: Task, method: &str) -> Result<Table> {
+    let found = PRESETS.iter().find(|(name, _)| *name == method);
+    let (_, text) = found.ok_or_else(|| Error::unknown("method", method, methods()))?;
+    let mut table: Table = toml::from_str(text).expect("our presets are TOML");
+    specialise(&mut table, task);
+    let Some(Value::String(base)) = table.remove("base") else { return Ok(table) };
+    let mut whole = preset(task, &base)?;
+    merge(&mut whole, table);
+    Ok(whole)
 }
 
 /// Puts the part of a table that is for this task over the rest of it.

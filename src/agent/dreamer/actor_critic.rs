@@ -201,8 +201,8 @@ impl ActorCritic {
                 let logits = self.critic.forward(features, Learning::FromData);
                 ops::scale_rows(world.bins().loss(logits, &[&dream.returns[t], &steady]), weights)
             });
-            of_policy += share * mean(values(&policy));
-            of_critic += share * mean(values(&critic));
+            of_policy += share * ops::mean(&policy);
+            of_critic += share * ops::mean(&critic);
             parts.extend([(share, policy), (share, critic)]);
         }
         let report = Losses::from([

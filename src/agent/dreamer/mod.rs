@@ -17,7 +17,7 @@ pub use actor_critic::{ActorCritic, ActorCriticConfig, Dream, SlowCritic};
 pub use planner::Imagined;
 pub use returns::{ReturnScale, lambda_returns, replayed_returns};
 
-use super::{Agent, Expectation, Losses, Mode, Seat};
+use super::{Agent, Expectation, Foreseen, Losses, Mode, Seat};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::open_loop::{OpenLoop, Trace, open_loop};
@@ -30,6 +30,9 @@ use crate::rng::{self, Rng};
 
 /// Each update is cut into so many parts, which learn side by side. A fixed number: results do not depend on the machine.
 const PARTS: usize = 2;
+
+/// Dreams that are shown of a moment.
+const SHOWN: usize = 12;
 
 /// Settings of [`Dreamer`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -237,12 +240,8 @@ impl Networks {
         let lesson = world.lesson(&mut tape, batch, &mut rng);
         let dream = behaviour.dream(world, &lesson.latent, &mut rng);
         let replayed = behaviour.replayed_loss(&mut tape, world, slow, batch, &lesson, &dream.returns[0]);
-        let mean = |loss: &crate::nn::Tensor3| {
-            let numbers = crate::nn::values(loss);
-            numbers.iter().sum::<f32>() / numbers.len() as f32
-        };
-        let mut losses: Losses = lesson.losses.iter().map(|(name, _, loss)| (*name, mean(loss))).collect();
-        losses.insert("replayed_value", mean(&replayed.1));
+        let mut losses: Losses = lesson.losses.iter().map(|(name, _, loss)| (*name, ops::mean(loss))).collect();
+        losses.insert("replayed_value", ops::mean(&replayed.1));
         losses.insert("posterior_entropy", lesson.entropies[0]);
         losses.insert("prior_entropy", lesson.entropies[1]);
         let mut all: Vec<_> = lesson.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
@@ -325,6 +324,21 @@ impl Agent for Dreamer {
         let busy: Vec<(&Seat, &mut Mind)> =
             seats.iter().map(|seat| (seat, minds[seat.number].take().expect("seats have different numbers"))).collect();
         busy.into_par_iter().map(|(seat, mind)| mind.act(networks, seat.obs, Mode::Evaluate)).collect()
+    }
+
+    fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
+        let action = self.act_all(&[*seat]).remove(0);
+        let Networks { world, behaviour, .. } = &self.networks;
+        let start = self.seats[seat.number].belief.repeated(0, SHOWN);
+        let dream = behaviour.dream(world, &start, &mut rng::stream(0, "dreamer foresight"));
+        let told: Vec<Vec<f32>> = dream.features.iter().map(|features| world.decode(features)).collect();
+        let width = seat.obs.len();
+        let foreseen = (0..SHOWN).map(|i| Foreseen {
+            observations: told.iter().map(|rows| rows[i * width..][..width].to_vec()).collect(),
+            value: dream.returns[0][i],
+            disagreement: 0.0,
+        });
+        (action, foreseen.collect())
     }
 
     fn observe(&mut self, transition: &Transition) {
