@@ -8,10 +8,11 @@
 //! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
 //! | 2 | [`agent`] | agents: the wiring of what stands below |
 //! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradients: optimisers of a closure over action sequences |
-//! | 1 | [`model`] | what was learned of the world: probabilistic ensembles, and imagination in them |
+//! | 1 | [`model`] | what was learned of the world: probabilistic ensembles, latent worlds, and imagination in both |
 //! | 1 | [`replay`] | what was experienced |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
 //! | 0 | [`env`](mod@env) | worlds to act in: the arm at its table, pendulum, cart-pole |
+//! | 0 | [`diff`] | simulators that can be differentiated, and trajectories optimised with their gradients |
 //! | 0 | [`rng`], [`files`], [`error`] | random numbers, files that are written whole, what can go wrong |
 //!
 //! What holds everywhere:
@@ -65,6 +66,7 @@
 #![warn(missing_docs)]
 
 pub mod agent;
+pub mod diff;
 pub mod env;
 pub mod error;
 pub mod files;

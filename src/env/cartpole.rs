@@ -3,7 +3,7 @@
 //! The continuous cart-pole of the PETS literature as mbrl-lib has it: Gym's equations, the force
 //! proportional to the action, reward 1 while the pole stands, 200 steps.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{RealField, UnitQuaternion, Vector3};
 
 use super::arm::{Pose, Primitive};
 use super::scene::Body;
@@ -18,7 +18,7 @@ const POLE: f64 = 0.1;
 const HALF_LENGTH: f64 = 0.5;
 const DT: f64 = 0.02;
 /// Force of a full action, N.
-const MAX_FORCE: f64 = 10.0;
+pub const MAX_FORCE: f64 = 10.0;
 /// The cart may be this far from the centre, m.
 const MAX_POSITION: f64 = 2.4;
 /// The pole may lean this far, rad (12 degrees).
@@ -46,21 +46,28 @@ impl CartPoleState {
 
     /// Pushes the cart with `force` (N) for one step of 0.02 s (explicit Euler, as in Gym).
     pub fn step(&mut self, force: f64) {
-        let (sin, cos) = self.angle.sin_cos();
-        let total = CART + POLE;
-        let pushed = (force + POLE * HALF_LENGTH * self.spin.powi(2) * sin) / total;
-        let turning = (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE * cos * cos / total));
-        let sliding = pushed - POLE * HALF_LENGTH * turning * cos / total;
-        self.position += DT * self.velocity;
-        self.velocity += DT * sliding;
-        self.angle += DT * self.spin;
-        self.spin += DT * turning;
+        let before = [self.position, self.velocity, self.angle, self.spin];
+        [self.position, self.velocity, self.angle, self.spin] = roll(before, force);
         self.elapsed += 1;
     }
 
     fn observe(&self) -> Vec<f32> {
         [self.position, self.velocity, self.angle, self.spin].map(|x| x as f32).to_vec()
     }
+}
+
+/// Position, velocity, angle and angular velocity after a step under a force (N), for any kind of number: dual numbers
+/// carry derivatives through it.
+pub fn roll<S: RealField + Copy>([position, velocity, angle, spin]: [S; 4], force: S) -> [S; 4] {
+    let number = nalgebra::convert::<f64, S>;
+    let (sin, cos) = angle.sin_cos();
+    let (total, lever) = (number(CART + POLE), number(POLE * HALF_LENGTH));
+    let pushed = (force + lever * spin.powi(2) * sin) / total;
+    let inertia = number(HALF_LENGTH) * (number(4.0 / 3.0) - number(POLE) * cos * cos / total);
+    let turning = (number(GRAVITY) * sin - cos * pushed) / inertia;
+    let sliding = pushed - lever * turning * cos / total;
+    let dt = number(DT);
+    [position + dt * velocity, velocity + dt * sliding, angle + dt * spin, spin + dt * turning]
 }
 
 /// The environment: observes the state; an action is a force divided by 10 N.

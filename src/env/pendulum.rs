@@ -2,7 +2,7 @@
 
 use std::f64::consts::PI;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{RealField, UnitQuaternion, Vector3};
 
 use super::arm::{Pose, Primitive};
 use super::scene::Body;
@@ -37,9 +37,7 @@ impl PendulumState {
     pub fn step(&mut self, torque: f64) -> f64 {
         let torque = torque.clamp(-MAX_TORQUE, MAX_TORQUE);
         let reward = reward(self.angle, self.speed, torque);
-        let acceleration = 1.5 * GRAVITY * self.angle.sin() + 3.0 * torque;
-        self.speed = (self.speed + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
-        self.angle += self.speed * DT;
+        [self.angle, self.speed] = swing([self.angle, self.speed], torque);
         self.elapsed += 1;
         reward
     }
@@ -51,6 +49,15 @@ impl PendulumState {
     fn upright(&self) -> bool {
         wrapped(self.angle).abs() < 0.2
     }
+}
+
+/// Angle and angular velocity after a step under a torque (N m), for any kind of number: dual numbers carry derivatives
+/// through it.
+pub fn swing<S: RealField + Copy>([angle, speed]: [S; 2], torque: S) -> [S; 2] {
+    let number = nalgebra::convert::<f64, S>;
+    let acceleration = number(1.5 * GRAVITY) * angle.sin() + number(3.0) * torque;
+    let speed = (speed + acceleration * number(DT)).clamp(number(-MAX_SPEED), number(MAX_SPEED));
+    [angle + speed * number(DT), speed]
 }
 
 fn reward(angle: f64, speed: f64, torque: f64) -> f64 {

@@ -1,0 +1,187 @@
+//! A planar pusher: a hand that pushes a block across a table with friction, seen from above.
+//!
+//! Contact is compliant and smooth. The block is a square with slightly rounded corners (a norm of power 8); the hand, a disk,
+//! is pressed back by a force that grows as a softplus of how far it has entered. The stiffer the contact, the nearer to a
+//! hard one, and the sharper the bend that gradients have to get over. Friction is Coulomb's, regularised: below a few
+//! millimetres a second it is viscous, and it is integrated implicitly, so that it never pushes back.
+
+use nalgebra::{RealField, SVector, Vector2};
+
+use super::System;
+
+/// Seconds of a control step.
+pub const DT: f64 = 0.05;
+/// Physics steps in it.
+const SUBSTEPS: usize = 25;
+/// Half the block's edge, m.
+pub const HALF: f64 = 0.02;
+/// Radius of the hand, m.
+pub const HAND: f64 = 0.01;
+/// Speed of the hand at a full action, m/s.
+pub const SPEED: f64 = 0.2;
+const GRAVITY: f64 = 9.81;
+/// Speed below which friction is viscous, m/s.
+const STICKING: f64 = 2e-3;
+/// The distance over which contact begins, m.
+const SOFTNESS: f64 = 5e-4;
+/// Friction between hand and block.
+const GRIP: f64 = 0.3;
+
+/// What the block is like. Numbers of any kind, so that what is recorded can be differentiated with respect to them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pusher<S> {
+    /// Mass of the block, kg.
+    pub mass: S,
+    /// Friction between block and table.
+    pub friction: S,
+    /// Force by which the hand is pressed back, for each metre that it enters, N/m.
+    pub stiffness: S,
+}
+
+impl Default for Pusher<f64> {
+    /// The cube of the `push` task: 4 cm, 64 g, friction 0.5.
+    fn default() -> Self {
+        Self { mass: 0.064, friction: 0.5, stiffness: 500.0 }
+    }
+}
+
+/// Numbers in a state: the hand's position (m), the block's position (m) and angle (rad), the block's velocity (m/s) and angular
+/// velocity (rad/s).
+pub const STATE: usize = 8;
+
+impl<S: RealField + Copy> Pusher<S> {
+    /// The state after a control step; the action is the hand's velocity divided by [`SPEED`].
+    pub fn step(&self, state: &SVector<S, STATE>, action: &SVector<S, 2>) -> SVector<S, STATE> {
+        let number = nalgebra::convert::<f64, S>;
+        let dt = number(DT / SUBSTEPS as f64);
+        let velocity = action * number(SPEED);
+        let mut hand = Vector2::new(state[0], state[1]);
+        let mut block = Vector2::new(state[2], state[3]);
+        let mut angle = state[4];
+        let mut moving = Vector2::new(state[5], state[6]);
+        let mut spin = state[7];
+        let inertia = self.mass * number(2.0 / 3.0 * HALF * HALF);
+        // Mean distance of the block's sole from its middle.
+        let lever = number(0.7652 * HALF);
+        for _ in 0..SUBSTEPS {
+            hand += velocity * dt;
+            let (force, arm) = self.contact(hand, velocity, block, angle, moving, spin);
+            moving += force * (dt / self.mass);
+            spin += (arm.x * force.y - arm.y * force.x) * (dt / inertia);
+            let hold = self.friction * number(GRAVITY) * dt;
+            let still = number(STICKING * STICKING);
+            moving /= S::one() + hold / (moving.norm_squared() + still).sqrt();
+            let rim = spin * lever;
+            let turning = hold * self.mass * lever * lever / inertia;
+            spin /= S::one() + turning / (rim * rim + still).sqrt();
+            block += moving * dt;
+            angle += spin * dt;
+        }
+        SVector::from([hand.x, hand.y, block.x, block.y, angle, moving.x, moving.y, spin])
+    }
+
+    /// The hand's force on the block, and where it acts, from the block's middle.
+    fn contact(
+        &self,
+        hand: Vector2<S>,
+        velocity: Vector2<S>,
+        block: Vector2<S>,
+        angle: S,
+        moving: Vector2<S>,
+        spin: S,
+    ) -> (Vector2<S>, Vector2<S>) {
+        let number = nalgebra::convert::<f64, S>;
+        let (sin, cos) = angle.sin_cos();
+        let away = hand - block;
+        // In the block's frame, in halves of its edge.
+        let half = number(HALF);
+        let p = Vector2::new(cos * away.x + sin * away.y, cos * away.y - sin * away.x) / half;
+        // |p|_8 and its gradient; never quite zero.
+        let powers = p.x.powi(8) + p.y.powi(8) + number(1e-6);
+        let size = powers.powf(number(0.125));
+        let normal = Vector2::new(p.x.powi(7), p.y.powi(7)) * (size / powers);
+        let entered = number(HAND) - (size - S::one()) * half;
+        let press = self.stiffness * softplus(entered, number(SOFTNESS));
+        let out = Vector2::new(cos * normal.x - sin * normal.y, sin * normal.x + cos * normal.y);
+        let out = out / (out.norm_squared() + number(1e-12)).sqrt();
+        let arm = away - out * number(HAND);
+        // How the hand slides over the block's side.
+        let side = Vector2::new(-out.y, out.x);
+        let surface = moving + Vector2::new(-arm.y, arm.x) * spin;
+        let slip = (velocity - surface).dot(&side);
+        let drag = number(GRIP) * press * slip / (slip * slip + number(1e-4)).sqrt();
+        (side * drag - out * press, arm)
+    }
+}
+
+/// `width ln(1 + exp(x / width))`, without overflow.
+fn softplus<S: RealField + Copy>(x: S, width: S) -> S {
+    let z = x / width;
+    let positive = if z > S::zero() { z } else { S::zero() };
+    width * (positive + (-z.abs()).exp().ln_1p())
+}
+
+/// Push the block to a place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PusherTask {
+    /// The block.
+    pub pusher: Pusher<f64>,
+    /// Where it has to go, m.
+    pub goal: [f64; 2],
+}
+
+impl PusherTask {
+    /// A guess to begin with: round the block to the side away from the goal, and then straight on. The block is not pushed
+    /// to the goal by it, but it is touched, and only from there on gradients know of it.
+    pub fn guess(&self, start: &SVector<f64, STATE>, steps: usize) -> Vec<SVector<f64, 2>> {
+        const ROUND: f64 = 3.5 * HALF;
+        let (mut hand, block) = (Vector2::new(start[0], start[1]), Vector2::new(start[2], start[3]));
+        let way = (Vector2::from(self.goal) - block).normalize();
+        let mut pushing = false;
+        let step = |_| {
+            let off = hand - block;
+            // How far round the block the hand still has to go, in (-pi, pi].
+            let left = off.perp(&-way).atan2(-off.dot(&way));
+            pushing |= left.abs() < 0.1 && off.norm() < 1.1 * ROUND;
+            let velocity = if pushing {
+                way * 0.4
+            } else {
+                let turned = off.y.atan2(off.x) + left.clamp(-0.4, 0.4);
+                let next = block + Vector2::new(turned.cos(), turned.sin()) * ROUND;
+                (next - hand) / (SPEED * DT)
+            };
+            let action = velocity / velocity.norm().max(1.0);
+            hand += action * (SPEED * DT);
+            action
+        };
+        (0..steps).map(step).collect()
+    }
+
+    /// How far the block is from its goal, m.
+    pub fn distance(&self, state: &SVector<f64, STATE>) -> f64 {
+        (state[2] - self.goal[0]).hypot(state[3] - self.goal[1])
+    }
+
+    fn error<S: RealField + Copy>(&self, state: &SVector<S, STATE>) -> S {
+        let number = nalgebra::convert::<f64, S>;
+        let (x, y) = (state[2] - number(self.goal[0]), state[3] - number(self.goal[1]));
+        // In decimetres.
+        number(100.0) * (x * x + y * y)
+    }
+}
+
+impl System<STATE, 2> for PusherTask {
+    fn step<S: RealField + Copy>(&self, state: &SVector<S, STATE>, action: &SVector<S, 2>) -> SVector<S, STATE> {
+        let Pusher { mass, friction, stiffness } = self.pusher;
+        let [mass, friction, stiffness] = [mass, friction, stiffness].map(nalgebra::convert::<f64, S>);
+        Pusher { mass, friction, stiffness }.step(state, action)
+    }
+
+    fn cost<S: RealField + Copy>(&self, state: &SVector<S, STATE>, action: &SVector<S, 2>) -> S {
+        nalgebra::convert::<f64, S>(0.1) * self.error(state) + nalgebra::convert::<f64, S>(1e-3) * action.norm_squared()
+    }
+
+    fn final_cost<S: RealField + Copy>(&self, state: &SVector<S, STATE>) -> S {
+        nalgebra::convert::<f64, S>(50.0) * self.error(state)
+    }
+}

@@ -1,0 +1,55 @@
+//! The classics, to be swung up: the equations are those of [`crate::env`].
+
+use nalgebra::{RealField, SVector};
+
+use super::System;
+use crate::env::{cartpole, pendulum};
+
+/// The pendulum: angle from upright and angular velocity; the action is a torque divided by 2 N m. The cost is smooth, where
+/// the environment's jumps as the angle wraps.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PendulumSwing;
+
+impl System<2, 1> for PendulumSwing {
+    fn step<S: RealField + Copy>(&self, state: &SVector<S, 2>, action: &SVector<S, 1>) -> SVector<S, 2> {
+        let torque = nalgebra::convert::<f64, S>(pendulum::MAX_TORQUE) * action[0];
+        SVector::from(pendulum::swing([state[0], state[1]], torque))
+    }
+
+    fn cost<S: RealField + Copy>(&self, state: &SVector<S, 2>, action: &SVector<S, 1>) -> S {
+        let number = nalgebra::convert::<f64, S>;
+        let height = S::one() - state[0].cos();
+        number(2.0) * height + number(0.1) * state[1] * state[1] + number(0.004) * action[0] * action[0]
+    }
+
+    fn final_cost<S: RealField + Copy>(&self, state: &SVector<S, 2>) -> S {
+        let number = nalgebra::convert::<f64, S>;
+        number(100.0) * (S::one() - state[0].cos()) + number(10.0) * state[1] * state[1]
+    }
+}
+
+/// The cart-pole, from hanging to upright in the middle: position, velocity, angle, angular velocity; the action is a force
+/// divided by 10 N.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CartPoleSwing;
+
+impl System<4, 1> for CartPoleSwing {
+    fn step<S: RealField + Copy>(&self, state: &SVector<S, 4>, action: &SVector<S, 1>) -> SVector<S, 4> {
+        let force = nalgebra::convert::<f64, S>(cartpole::MAX_FORCE) * action[0];
+        SVector::from(cartpole::roll([state[0], state[1], state[2], state[3]], force))
+    }
+
+    fn cost<S: RealField + Copy>(&self, state: &SVector<S, 4>, action: &SVector<S, 1>) -> S {
+        let number = nalgebra::convert::<f64, S>;
+        number(0.1) * state[0] * state[0]
+            + (S::one() - state[2].cos())
+            + number(0.01) * (state[1] * state[1] + state[3] * state[3])
+            + number(0.01) * action[0] * action[0]
+    }
+
+    fn final_cost<S: RealField + Copy>(&self, state: &SVector<S, 4>) -> S {
+        let number = nalgebra::convert::<f64, S>;
+        let motion = state[1] * state[1] + state[3] * state[3];
+        number(100.0) * (S::one() - state[2].cos()) + number(10.0) * (motion + state[0] * state[0])
+    }
+}

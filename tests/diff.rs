@@ -1,0 +1,147 @@
+//! Simulators that can be differentiated: every way to a gradient leads to the same one, and good actions are found with it.
+
+use std::f64::consts::PI;
+
+use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_forward, linearise};
+use handful::diff::pusher::STATE;
+use handful::diff::{CartPoleSwing, Ilqr, IlqrConfig, PendulumSwing, Pusher, PusherTask, System};
+use handful::env::cartpole::CartPoleState;
+use handful::env::pendulum::PendulumState;
+use handful::rng::{self, Rng, uniform};
+use nalgebra::SVector;
+
+const STEPS: usize = 50;
+
+fn actions<const M: usize>(rng: &mut Rng) -> Vec<SVector<f64, M>> {
+    (0..STEPS).map(|_| SVector::from_fn(|_, _| uniform(rng, -0.9, 0.9))).collect()
+}
+
+fn close(what: &str, a: f64, b: f64, scale: f64, tolerance: f64) {
+    assert!((a - b).abs() <= tolerance * scale, "{what}: {a} and {b}, where {scale} is large");
+}
+
+/// Forward mode, reverse mode and differences of a roll-out; Jacobians and differences of its first step.
+fn gradients_agree<const N: usize, const M: usize>(
+    system: &impl System<N, M>,
+    start: &SVector<f64, N>,
+    actions: &[SVector<f64, M>],
+) {
+    let (_, reverse, by_start) = gradient(system, start, actions);
+    let forward = gradient_forward(system, start, actions);
+    let differences = gradient_by_differences(system, start, actions, 1e-6);
+    let scale = reverse.iter().map(|g| g.amax()).fold(1e-9, f64::max);
+    for t in 0..actions.len() {
+        for i in 0..M {
+            close("forward and reverse", forward[t][i], reverse[t][i], scale, 1e-10);
+            close("differences and reverse", differences[t][i], reverse[t][i], scale, 1e-5);
+        }
+    }
+    assert!(by_start.iter().all(|slope| slope.is_finite()));
+
+    let line = linearise(system, start, &actions[0]);
+    for i in 0..N {
+        const H: f64 = 1e-6;
+        let at = |by: f64| {
+            let mut start = *start;
+            start[i] += by;
+            system.step(&start, &actions[0])
+        };
+        let column = (at(H) - at(-H)) / (2.0 * H);
+        let scale = line.by_state.column(i).amax().max(1e-3);
+        (0..N).for_each(|j| close("a step's Jacobian", line.by_state[(j, i)], column[j], scale, 1e-5));
+    }
+}
+
+#[test]
+fn every_way_to_a_gradient_leads_to_the_same_one() {
+    let mut rng = rng::stream(0, "diff");
+    for _ in 0..5 {
+        let start = SVector::from([uniform(&mut rng, -3.0, 3.0), uniform(&mut rng, -1.0, 1.0)]);
+        gradients_agree(&PendulumSwing, &start, &actions::<1>(&mut rng));
+        let start = SVector::from([0; 4].map(|_| uniform(&mut rng, -1.0, 1.0)));
+        gradients_agree(&CartPoleSwing, &start, &actions::<1>(&mut rng));
+    }
+}
+
+/// The hand runs into the block: contact lies within the roll-out.
+#[test]
+fn so_it_does_through_contact() {
+    let mut rng = rng::stream(1, "diff");
+    for _ in 0..5 {
+        let task = PusherTask { pusher: Pusher::default(), goal: [0.1, uniform(&mut rng, -0.03, 0.03)] };
+        let mut start = SVector::<f64, STATE>::zeros();
+        start[0] = uniform(&mut rng, -0.06, -0.04);
+        start[1] = uniform(&mut rng, -0.008, 0.008);
+        start[4] = uniform(&mut rng, -0.3, 0.3);
+        let push: Vec<_> =
+            (0..STEPS).map(|_| SVector::from([uniform(&mut rng, 0.1, 0.5), uniform(&mut rng, -0.2, 0.2)])).collect();
+        let (states, _) = handful::diff::roll_out(&task, &start, &push);
+        let moved = states[STEPS][2].hypot(states[STEPS][3]);
+        assert!(moved > 0.03, "the block is pushed, not missed: {moved} m");
+        gradients_agree(&task, &start, &push);
+    }
+}
+
+/// The equations are the environments' own.
+#[test]
+fn the_classics_are_those_of_the_environments() {
+    let mut rng = rng::stream(2, "diff");
+    for _ in 0..100 {
+        let (angle, speed, torque) =
+            (uniform(&mut rng, -3.0, 3.0), uniform(&mut rng, -7.0, 7.0), uniform(&mut rng, -1.0, 1.0));
+        let mut state = PendulumState::new(angle, speed);
+        state.step(2.0 * torque);
+        let next = PendulumSwing.step(&SVector::from([angle, speed]), &SVector::from([torque]));
+        assert_eq!([next[0], next[1]], [state.angle, state.speed]);
+
+        let start = [0; 4].map(|_| uniform(&mut rng, -1.0, 1.0));
+        let mut state = CartPoleState::new(start);
+        state.step(10.0 * torque);
+        let next = CartPoleSwing.step(&SVector::from(start), &SVector::from([torque]));
+        assert_eq!(<[f64; 4]>::from(next), [state.position, state.velocity, state.angle, state.spin]);
+    }
+}
+
+#[test]
+fn ilqr_swings_up_pendulum_and_cart_pole() {
+    let mut rng = rng::stream(3, "diff");
+    let mut guess = |count: usize| -> Vec<SVector<f64, 1>> {
+        (0..count).map(|_| SVector::from([0.1 * rng::normal(&mut rng)])).collect()
+    };
+    let ilqr = Ilqr::new(IlqrConfig { iterations: 300, ..IlqrConfig::default() });
+    let found = ilqr.solve(&PendulumSwing, &SVector::from([PI, 0.0]), &guess(100));
+    let end = found.states[100];
+    println!("pendulum: {} iterations, {} steps, cost {:.2}, end {end:?}", found.iterations, found.steps, found.cost);
+    assert!(end[0].cos() > 0.99 && end[1].abs() < 0.3, "{end}");
+    assert!(found.actions.iter().all(|action| action[0].abs() <= 1.0));
+
+    let found = ilqr.solve(&CartPoleSwing, &SVector::from([0.0, 0.0, PI, 0.0]), &guess(150));
+    let end = found.states[150];
+    println!("cart-pole: {} iterations, {} steps, cost {:.2}, end {end:?}", found.iterations, found.steps, found.cost);
+    assert!(end[2].cos() > 0.99 && end[3].abs() < 0.5, "{end}");
+    assert!(found.actions.iter().all(|action| action[0].abs() <= 1.0));
+}
+
+/// From wherever the hand is, to goals all around.
+#[test]
+fn ilqr_pushes_the_block_to_random_goals() {
+    const GOALS: usize = 100;
+    let mut rng = rng::stream(4, "diff");
+    let ilqr = Ilqr::new(IlqrConfig { iterations: 60, tolerance: 1e-4, ..IlqrConfig::default() });
+    let (mut reached, mut steps) = (0, 0);
+    for _ in 0..GOALS {
+        let direction = uniform(&mut rng, -PI, PI);
+        let distance = uniform(&mut rng, 0.05, 0.15);
+        let task =
+            PusherTask { pusher: Pusher::default(), goal: [distance * direction.cos(), distance * direction.sin()] };
+        let mut start = SVector::<f64, STATE>::zeros();
+        let from = uniform(&mut rng, -PI, PI);
+        (start[0], start[1]) = (0.07 * from.cos(), 0.07 * from.sin());
+        start[4] = uniform(&mut rng, -0.78, 0.78);
+        let found = ilqr.solve(&task, &start, &task.guess(&start, 60));
+        steps += found.steps;
+        reached += usize::from(task.distance(&found.states[60]) < 0.01);
+    }
+    println!("{reached} of {GOALS} goals within 1 cm, {} steps each", steps / GOALS);
+    assert!(reached >= 95, "{reached} of {GOALS} goals are reached within 1 cm");
+}
