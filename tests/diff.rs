@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_forward, linearise};
 use handful::diff::pusher::STATE;
-use handful::diff::{CartPoleSwing, Ilqr, IlqrConfig, PendulumSwing, Pusher, PusherTask, System};
+use handful::diff::{CartPoleSwing, Ilqr, IlqrConfig, PendulumSwing, Pusher, PusherTask, Recording, System};
 use handful::env::cartpole::CartPoleState;
 use handful::env::pendulum::PendulumState;
 use handful::rng::{self, Rng, uniform};
@@ -144,4 +144,32 @@ fn ilqr_pushes_the_block_to_random_goals() {
     }
     println!("{reached} of {GOALS} goals within 1 cm, {} steps each", steps / GOALS);
     assert!(reached >= 95, "{reached} of {GOALS} goals are reached within 1 cm");
+}
+
+/// A block that the simulator itself has pushed about is found again, from a guess that is wrong by a factor of two and more.
+#[test]
+fn mass_and_friction_are_found_again() {
+    let truth = Pusher { mass: 0.064, friction: 0.5, stiffness: 500.0 };
+    let task = PusherTask { pusher: truth, goal: [0.1, 0.0] };
+    let mut state = SVector::<f64, STATE>::zeros();
+    (state[0], state[1]) = (-0.04, 0.006);
+    let mut recording = Recording::default();
+    for t in 0..40 {
+        recording.hand.push([state[0], state[1]]);
+        recording.block.push([state[2], state[3], state[4]]);
+        // A quick push, a stop, a slower one: the block slides on by itself in between.
+        let speed = if t < 12 {
+            0.9
+        } else if t < 20 {
+            -0.3
+        } else {
+            0.5
+        };
+        state = task.step(&state, &SVector::from([speed, 0.1]));
+    }
+    let found = recording.identify(Pusher { mass: 0.15, friction: 0.2, ..truth });
+    println!("{found:?}");
+    assert!((found.pusher.mass / truth.mass - 1.0).abs() < 0.01, "{found:?}");
+    assert!((found.pusher.friction / truth.friction - 1.0).abs() < 0.01, "{found:?}");
+    assert!(found.residual < 1e-5, "{found:?}");
 }

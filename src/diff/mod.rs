@@ -5,6 +5,7 @@
 //! whole roll-outs, forwards and backwards; [`Ilqr`] finds good actions with them.
 
 pub mod derivatives;
+mod identify;
 mod ilqr;
 
 pub mod pusher;
@@ -12,6 +13,7 @@ mod swing;
 
 use nalgebra::{RealField, SVector};
 
+pub use identify::{Identified, Recording};
 pub use ilqr::{Ilqr, IlqrConfig, Solution};
 
 pub use pusher::{Pusher, PusherTask};
