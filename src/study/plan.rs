@@ -34,7 +34,7 @@ pub struct StudyPlan {
 impl StudyPlan {
     /// What a profile takes on, unless told otherwise.
     pub fn new(profile: Profile, folder: PathBuf) -> Self {
-        let methods = ["random", "scripted", "oracle", "pets", "sac"].map(String::from).into();
+        let methods = ["random", "scripted", "oracle", "pets", "dreamer", "sac"].map(String::from).into();
         match profile {
             Profile::Quick => Self { tasks: vec![Task::Reach], methods, seeds: 0..2, folder },
             Profile::Full => Self { tasks: vec![Task::Reach, Task::Push, Task::Lift], methods, seeds: 0..5, folder },
