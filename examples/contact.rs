@@ -198,8 +198,8 @@ fn draw(rows: &[Row]) -> Result<(), Box<dyn Error>> {
     let panels = area.split_evenly((1, 2));
     type Reading = fn(&Row) -> f64;
     let about: [(&str, Reading, f64); 2] = [
-        ("bias: distance from the smoothed gradient", |row| row.bias, 2.0),
-        ("deviation of one shaken gradient", |row| row.first_order_deviation, 6.0),
+        ("bias: distance from the smoothed gradient", |row| row.bias, 0.8),
+        ("deviation of one shaken gradient", |row| row.first_order_deviation, 2.4),
     ];
     let colours = [RGBColor(0, 114, 178), RGBColor(0, 158, 115), RGBColor(230, 159, 0), RGBColor(213, 94, 0)];
     for (panel, (title, reading, top)) in panels.iter().zip(about) {
