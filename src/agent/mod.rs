@@ -5,6 +5,7 @@ pub mod dreamer;
 mod oracle;
 mod pets;
 mod sac;
+mod warm_up;
 
 pub use baselines::{Random, Scripted};
 pub use dreamer::{Dreamer, DreamerConfig};

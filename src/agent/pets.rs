@@ -7,6 +7,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::warm_up::RandomActions;
 use super::{Agent, Foreseen, Losses, Mode, Seat};
 use crate::env::{KnownReward, Spec};
 use crate::error::{Error, Result};
@@ -16,7 +17,6 @@ use crate::model::{
     Differentiable, Dynamics, Ensemble, EnsembleConfig, Futures, Imagination, Propagation, Reward, Value,
 };
 use crate::nn::Weights;
-use crate::plan::noise::ColoredNoise;
 use crate::plan::{
     ControlConfig, IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences,
 };
@@ -105,8 +105,7 @@ pub struct Pets {
     dynamics: Option<Dynamics>,
     replay: ReplayBuffer,
     observed: usize,
-    /// Random actions for the rest of a warm-up episode.
-    random: Vec<f32>,
+    random: RandomActions,
     /// Plans where it learns.
     pilot: Pilot,
     /// Plan where it is judged, one for each seat.
@@ -134,7 +133,7 @@ impl Pets {
             dynamics: None,
             replay: ReplayBuffer::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
-            random: Vec::new(),
+            random: RandomActions::new(config.warm_up_colour, spec.horizon, spec.action_size),
             pilot: Pilot::new(&config, spec, rng::stream(seed, "pets planner")),
             seats: Vec::new(),
             spec: spec.clone(),
@@ -175,17 +174,6 @@ impl Pets {
             losses.insert("model_error", mean as f32);
         }
         losses
-    }
-
-    /// The next number of coloured noise for each number of an action.
-    fn explore(&mut self) -> Vec<f32> {
-        let size = self.spec.action_size;
-        if self.random.is_empty() {
-            let noise = ColoredNoise::new(self.config.warm_up_colour, self.spec.horizon.max(2));
-            let actions = noise.sample_actions(size, &mut self.rng);
-            self.random = actions.iter().map(|a| a.clamp(-1.0, 1.0) as f32).collect();
-        }
-        self.random.drain(..size).collect()
     }
 }
 
@@ -290,7 +278,7 @@ impl<'a> View<'a> {
 
 impl Agent for Pets {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
-        let Some(dynamics) = &self.dynamics else { return self.explore() };
+        let Some(dynamics) = &self.dynamics else { return self.random.next(&mut self.rng) };
         let view = View::new(&self.config, dynamics, self.reward.as_ref());
         let curiosity = if mode == Mode::Explore { self.config.curiosity } else { 0.0 };
         self.pilot.act(&view, obs, curiosity, &mut |_| {})
@@ -332,7 +320,7 @@ impl Agent for Pets {
         self.observed += 1;
         if transition.terminated || transition.truncated {
             self.pilot.control.reset();
-            self.random.clear();
+            self.random.reset();
         }
     }
 
@@ -374,7 +362,7 @@ impl Agent for Pets {
         self.observed = counts[0] as usize;
         self.rng = rng::from_state(&own);
         self.pilot = Pilot::new(&self.config, &self.spec, rng::from_state(&planner));
-        self.random.clear();
+        self.random.reset();
         Ok(())
     }
 }

@@ -17,13 +17,13 @@ pub use actor_critic::{ActorCritic, ActorCriticConfig, Dream, SlowCritic};
 pub use planner::Imagined;
 pub use returns::{ReturnScale, lambda_returns, replayed_returns};
 
+use super::warm_up::RandomActions;
 use super::{Agent, Expectation, Foreseen, Losses, Mode, Seat};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::open_loop::{OpenLoop, Trace, open_loop};
 use crate::model::{Latent, WorldModel, WorldModelConfig};
 use crate::nn::{Adam, AdamConfig, Parameters, Weights, ops, parameters_of_fields, tensor};
-use crate::plan::noise::ColoredNoise;
 use crate::plan::{ControlConfig, PlannerConfig, RecedingHorizon};
 use crate::replay::{SequenceReplay, Sequences, Transition};
 use crate::rng::{self, Rng};
@@ -118,7 +118,6 @@ parameters_of_fields!(Networks: world, behaviour);
 pub struct Dreamer {
     config: DreamerConfig,
     actions: usize,
-    horizon: usize,
     networks: Networks,
     optimiser: Adam,
     scale: ReturnScale,
@@ -126,7 +125,7 @@ pub struct Dreamer {
     observed: usize,
     /// Updates that are owed for what was lived through.
     owed: f32,
-    random: Vec<f32>,
+    random: RandomActions,
     /// Acts where it learns.
     mind: Mind,
     /// Act where it is judged, one for each seat.
@@ -162,7 +161,6 @@ impl Dreamer {
         let optimiser = AdamConfig { warm_up: config.learning_warm_up, ..AdamConfig::laprop(config.learning_rate) };
         let mut agent = Self {
             actions: spec.action_size,
-            horizon: spec.horizon,
             mind: Mind::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
             networks: Networks { world, behaviour, slow },
             optimiser: Adam::new(optimiser),
@@ -170,7 +168,7 @@ impl Dreamer {
             replay: SequenceReplay::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
             owed: 0.0,
-            random: Vec::new(),
+            random: RandomActions::new(config.warm_up_colour, spec.horizon, spec.action_size),
             seats: Vec::new(),
             rng,
             config,
@@ -219,16 +217,6 @@ impl Dreamer {
         let Networks { behaviour, slow, .. } = &mut self.networks;
         behaviour.guide(slow);
         losses
-    }
-
-    /// The next number of coloured noise for each number of an action.
-    fn explore(&mut self) -> Vec<f32> {
-        if self.random.is_empty() {
-            let noise = ColoredNoise::new(self.config.warm_up_colour, self.horizon.max(2));
-            let actions = noise.sample_actions(self.actions, &mut self.rng);
-            self.random = actions.iter().map(|a| a.clamp(-1.0, 1.0) as f32).collect();
-        }
-        self.random.drain(..self.actions).collect()
     }
 }
 
@@ -303,7 +291,7 @@ impl Mind {
 impl Agent for Dreamer {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         if self.observed < self.config.warm_up && mode == Mode::Explore {
-            return self.explore();
+            return self.random.next(&mut self.rng);
         }
         self.mind.act(&self.networks, obs, mode)
     }
@@ -346,7 +334,7 @@ impl Agent for Dreamer {
         self.observed += 1;
         if transition.terminated || transition.truncated {
             self.mind.forget(&self.networks.world);
-            self.random.clear();
+            self.random.reset();
         }
     }
 
@@ -420,7 +408,7 @@ impl Agent for Dreamer {
         self.owed = owed;
         self.rng = rng::from_state(&own);
         self.mind = Mind::new(&self.networks.world, &self.config, self.actions, rng::from_state(&mind));
-        self.random.clear();
+        self.random.reset();
         Ok(())
     }
 }
