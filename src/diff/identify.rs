@@ -2,12 +2,18 @@
 //!
 //! A recorded push is played again in the [`Pusher`]; dual numbers tell how every recorded pose would change with the block's
 //! mass and friction, and Gauss-Newton steps (Levenberg's, damped) lead to those that explain it best. Both are sought as
-//! logarithms, since both are positive.
+//! logarithms, since both are positive, and believed to lie near the guess as long as the recording does not say otherwise: a
+//! slow push tells next to nothing of a mass.
 
 use nalgebra::{SMatrix, SVector, Vector2};
 use num_dual::{Derivative, DualSVec64};
 
 use super::pusher::{DT, HALF, Pusher, SPEED, STATE};
+
+/// How far a guess may be off: the standard deviation of the two logarithms beforehand.
+const DOUBT: f64 = 1.0;
+/// What of a pose no simulator explains, m: the weight of the recording against the guess.
+const NOISE: f64 = 1e-3;
 
 /// A push as it was seen, once each control step, the start included.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -23,7 +29,8 @@ pub struct Recording {
 pub struct Identified {
     /// The block that explains the recording best.
     pub pusher: Pusher<f64>,
-    /// Standard deviations of the logarithms of mass and friction, if what is left unexplained is noise.
+    /// Standard deviations of the logarithms of mass and friction, if what is left unexplained is noise. Where they are near one
+    /// the recording has not told anything, and the guess was kept.
     pub deviations: [f64; 2],
     /// Root mean square of what is left unexplained, m; angles count by how far they move the middle of an edge.
     pub residual: f64,
@@ -38,31 +45,31 @@ struct Residuals {
 }
 
 impl Recording {
-    /// Finds mass and friction near `guess`, whose stiffness is kept. The block is taken to be at rest at first. A whole
-    /// trajectory has valleys that lead nowhere; so the search begins several times, a factor of three up and down too.
+    /// Finds mass and friction near `guess`, whose grip and stiffness are kept. The block is taken to be at rest at first. A
+    /// whole trajectory has valleys that lead nowhere; so the search begins several times, a factor of three up and down too.
     pub fn identify(&self, guess: Pusher<f64>) -> Identified {
         const FACTORS: [f64; 3] = [1.0, 1.0 / 3.0, 3.0];
-        let beginnings = FACTORS.iter().flat_map(|mass| FACTORS.map(|friction| (mass, friction)));
-        let found = beginnings.map(|(mass, friction)| {
-            self.descend(Pusher { mass: guess.mass * mass, friction: guess.friction * friction, ..guess })
-        });
-        found.min_by(|a, b| a.residual.total_cmp(&b.residual)).expect("several beginnings")
+        let beginnings = FACTORS.iter().flat_map(|mass| FACTORS.map(|friction| Vector2::new(mass.ln(), friction.ln())));
+        let found = beginnings.map(|off| self.descend(&guess, off));
+        let (_, found) = found.min_by(|a, b| a.0.total_cmp(&b.0)).expect("several beginnings");
+        found
     }
 
-    fn descend(&self, guess: Pusher<f64>) -> Identified {
+    /// Gauss-Newton steps from `off` the guess, in logarithms. Returns what was minimised, too.
+    fn descend(&self, guess: &Pusher<f64>, off: Vector2<f64>) -> (f64, Identified) {
         const MOST: usize = 60;
-        let mut at = Vector2::new(guess.mass.ln(), guess.friction.ln());
-        let mut here = self.residuals(at, guess.stiffness);
+        let mut at = off;
+        let mut here = self.residuals(guess, at);
         let mut damping = 1e-3;
         let mut iterations = 0;
         while iterations < MOST && damping < 1e8 {
             iterations += 1;
             let (curvature, slope) = here.normal();
-            let damped = curvature + SMatrix::from_diagonal(&curvature.diagonal().map(|c| damping * c.max(1e-12)));
+            let damped = curvature + SMatrix::from_diagonal(&(curvature.diagonal() * damping));
             let Some(step) = damped.try_inverse().map(|inverse| -(inverse * slope)) else { break };
             // No more than a factor of e at a time.
             let step = step / step.amax().max(1.0);
-            let there = self.residuals(at + step, guess.stiffness);
+            let there = self.residuals(guess, at + step);
             if there.square() < here.square() {
                 let improved = here.square() - there.square();
                 (at, here, damping) = (at + step, there, damping / 5.0);
@@ -73,34 +80,35 @@ impl Recording {
                 damping *= 5.0;
             }
         }
-        let count = here.values.len() as f64;
-        let noise = here.square() / (count - 2.0).max(1.0);
-        let spread = here
-            .normal()
-            .0
-            .try_inverse()
-            .map_or([f64::INFINITY; 2], |inverse| [0, 1].map(|i| (noise * inverse[(i, i)]).max(0.0).sqrt()));
-        Identified {
-            pusher: Pusher { mass: at[0].exp(), friction: at[1].exp(), stiffness: guess.stiffness },
-            deviations: spread,
-            residual: (here.square() / count).sqrt(),
+        let seen = &here.values[2..];
+        let square: f64 = seen.iter().map(|value| value * value).sum();
+        let noise = (square / (seen.len() as f64 - 2.0).max(1.0)).sqrt();
+        let inverse = here.normal().0.try_inverse().expect("a guess leaves nothing undecided");
+        let identified = Identified {
+            pusher: Pusher { mass: guess.mass * at[0].exp(), friction: guess.friction * at[1].exp(), ..*guess },
+            deviations: [0, 1].map(|i| (noise * inverse[(i, i)].sqrt()).min(DOUBT)),
+            residual: (square / seen.len() as f64).sqrt(),
             iterations,
-        }
+        };
+        (here.square(), identified)
     }
 
     /// The poses that a block would have had under this hand.
     pub fn play(&self, pusher: &Pusher<f64>) -> Vec<[f64; 3]> {
-        self.poses(pusher.mass, pusher.friction, pusher.stiffness)
+        self.poses(pusher)
     }
 
-    fn residuals(&self, logarithms: Vector2<f64>, stiffness: f64) -> Residuals {
-        let variable = |i: usize| {
-            let direction = SVector::<f64, 2>::from_fn(|j, _| f64::from(u8::from(i == j)));
-            let logarithm = DualSVec64::<2>::new(logarithms[i], Derivative::some(direction));
-            nalgebra::ComplexField::exp(logarithm)
+    fn residuals(&self, guess: &Pusher<f64>, off: Vector2<f64>) -> Residuals {
+        let direction = |i: usize| SVector::<f64, 2>::from_fn(|j, _| f64::from(u8::from(i == j)));
+        let factor = |i: usize| nalgebra::ComplexField::exp(DualSVec64::new(off[i], Derivative::some(direction(i))));
+        let pusher = guess.cast::<DualSVec64<2>>();
+        let poses =
+            self.poses(&Pusher { mass: pusher.mass * factor(0), friction: pusher.friction * factor(1), ..pusher });
+        // The guess is two residuals more.
+        let mut residuals = Residuals {
+            values: (off * (NOISE / DOUBT)).iter().copied().collect(),
+            slopes: [0, 1].map(|i| direction(i) * (NOISE / DOUBT)).to_vec(),
         };
-        let poses = self.poses(variable(0), variable(1), DualSVec64::from_re(stiffness));
-        let mut residuals = Residuals { values: Vec::new(), slopes: Vec::new() };
         for (pose, seen) in poses.iter().zip(&self.block).skip(1) {
             for ((number, seen), size) in pose.iter().zip(seen).zip([1.0, 1.0, HALF]) {
                 residuals.values.push(size * (number.re - seen));
@@ -111,9 +119,8 @@ impl Recording {
         residuals
     }
 
-    fn poses<S: nalgebra::RealField + Copy>(&self, mass: S, friction: S, stiffness: S) -> Vec<[S; 3]> {
+    fn poses<S: nalgebra::RealField + Copy>(&self, pusher: &Pusher<S>) -> Vec<[S; 3]> {
         let number = nalgebra::convert::<f64, S>;
-        let pusher = Pusher { mass, friction, stiffness };
         let ([x, y], [block_x, block_y, angle]) = (self.hand[0], self.block[0]);
         let mut state = SVector::<S, STATE>::zeros();
         [x, y, block_x, block_y, angle].into_iter().enumerate().for_each(|(i, value)| state[i] = number(value));

@@ -110,6 +110,36 @@ impl Ilqr {
     }
 }
 
+/// Receding-horizon control with it: at every step the last solution, moved on, is improved a little.
+pub struct IlqrControl<const M: usize> {
+    ilqr: Ilqr,
+    ahead: Vec<SVector<f64, M>>,
+}
+
+impl<const M: usize> IlqrControl<M> {
+    /// A controller that begins with a guess as long as it is to look ahead.
+    ///
+    /// # Panics
+    /// If the guess is empty.
+    pub fn new(ilqr: Ilqr, guess: Vec<SVector<f64, M>>) -> Self {
+        assert!(!guess.is_empty(), "at least one step to look ahead");
+        Self { ilqr, ahead: guess }
+    }
+
+    /// The next action, and the solution that it is the first of.
+    pub fn act<const N: usize>(
+        &mut self,
+        system: &impl System<N, M>,
+        state: &SVector<f64, N>,
+    ) -> (SVector<f64, M>, Solution<N, M>) {
+        let solution = self.ilqr.solve(system, state, &self.ahead);
+        self.ahead.clone_from(&solution.actions);
+        let first = self.ahead.remove(0);
+        self.ahead.push(self.ahead.last().copied().unwrap_or(first));
+        (first, solution)
+    }
+}
+
 /// The pass backwards. `None` if the curvature is not positive, so that no best change exists.
 fn backward<const N: usize, const M: usize>(
     system: &impl System<N, M>,

@@ -2,20 +2,21 @@
 //! derivatives through them, exactly.
 //!
 //! A [`System`] is such a simulator with a cost to be kept low. [`derivatives`] has the Jacobians of a step and the gradients of
-//! whole roll-outs, forwards and backwards; [`Ilqr`] finds good actions with them.
+//! whole roll-outs, forwards and backwards; [`Ilqr`] finds good actions with them, [`PolicySearch`] good policies, and
+//! [`Recording::identify`] the world's own parameters.
 
 pub mod derivatives;
 mod identify;
 mod ilqr;
-
+mod policy;
 pub mod pusher;
 mod swing;
 
 use nalgebra::{RealField, SVector};
 
 pub use identify::{Identified, Recording};
-pub use ilqr::{Ilqr, IlqrConfig, Solution};
-
+pub use ilqr::{Ilqr, IlqrConfig, IlqrControl, Solution};
+pub use policy::{Habitat, PolicySearch, PolicySearchConfig};
 pub use pusher::{Pusher, PusherTask};
 pub use swing::{CartPoleSwing, PendulumSwing};
 

@@ -1,7 +1,7 @@
 //! A planar pusher: a hand that pushes a block across a table with friction, seen from above.
 //!
-//! Contact is compliant and smooth. The block is a square with slightly rounded corners (a norm of power 8); the hand, a disk,
-//! is pressed back by a force that grows as a softplus of how far it has entered. The stiffer the contact, the nearer to a
+//! Contact is compliant and smooth. The block is a square with slightly rounded corners (a norm of power 8); the hand, a disk
+//! or two, is pressed back by a force that grows as a softplus of how far it has entered. The stiffer the contact, the nearer to a
 //! hard one, and the sharper the bend that gradients have to get over. Friction is Coulomb's, regularised: below a few
 //! millimetres a second it is viscous, and it is integrated implicitly, so that it never pushes back.
 
@@ -15,8 +15,8 @@ pub const DT: f64 = 0.05;
 const SUBSTEPS: usize = 25;
 /// Half the block's edge, m.
 pub const HALF: f64 = 0.02;
-/// Radius of the hand, m.
-pub const HAND: f64 = 0.01;
+/// Radius of a finger, m.
+pub const FINGER: f64 = 0.01;
 /// Speed of the hand at a full action, m/s.
 pub const SPEED: f64 = 0.2;
 const GRAVITY: f64 = 9.81;
@@ -24,8 +24,6 @@ const GRAVITY: f64 = 9.81;
 const STICKING: f64 = 2e-3;
 /// The distance over which contact begins, m.
 const SOFTNESS: f64 = 5e-4;
-/// Friction between hand and block.
-const GRIP: f64 = 0.3;
 
 /// What the block is like. Numbers of any kind, so that what is recorded can be differentiated with respect to them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,14 +32,28 @@ pub struct Pusher<S> {
     pub mass: S,
     /// Friction between block and table.
     pub friction: S,
-    /// Force by which the hand is pressed back, for each metre that it enters, N/m.
+    /// Friction between hand and block.
+    pub grip: S,
+    /// Force by which a finger is pressed back, for each metre that it enters, N/m.
     pub stiffness: S,
+    /// How far its two fingers are from the hand's middle, along y, m. At zero there is only one.
+    pub spread: S,
 }
 
 impl Default for Pusher<f64> {
     /// The cube of the `push` task: 4 cm, 64 g, friction 0.5.
     fn default() -> Self {
-        Self { mass: 0.064, friction: 0.5, stiffness: 500.0 }
+        Self { mass: 0.064, friction: 0.5, grip: 0.3, stiffness: 500.0, spread: 0.0 }
+    }
+}
+
+impl Pusher<f64> {
+    /// The same block in numbers of another kind.
+    pub(super) fn cast<S: RealField + Copy>(&self) -> Pusher<S> {
+        let Pusher { mass, friction, grip, stiffness, spread } = *self;
+        let [mass, friction, grip, stiffness, spread] =
+            [mass, friction, grip, stiffness, spread].map(nalgebra::convert);
+        Pusher { mass, friction, grip, stiffness, spread }
     }
 }
 
@@ -65,9 +77,16 @@ impl<S: RealField + Copy> Pusher<S> {
         let lever = number(0.7652 * HALF);
         for _ in 0..SUBSTEPS {
             hand += velocity * dt;
-            let (force, arm) = self.contact(hand, velocity, block, angle, moving, spin);
+            let (mut force, mut torque) = (Vector2::zeros(), S::zero());
+            let fingers = [self.spread, -self.spread];
+            for finger in &fingers[..if self.spread.is_zero() { 1 } else { 2 }] {
+                let finger = hand + Vector2::new(S::zero(), *finger);
+                let (press, arm) = self.contact(finger, velocity, block, angle, moving, spin);
+                force += press;
+                torque += arm.perp(&press);
+            }
             moving += force * (dt / self.mass);
-            spin += (arm.x * force.y - arm.y * force.x) * (dt / inertia);
+            spin += torque * (dt / inertia);
             let hold = self.friction * number(GRAVITY) * dt;
             let still = number(STICKING * STICKING);
             moving /= S::one() + hold / (moving.norm_squared() + still).sqrt();
@@ -80,10 +99,10 @@ impl<S: RealField + Copy> Pusher<S> {
         SVector::from([hand.x, hand.y, block.x, block.y, angle, moving.x, moving.y, spin])
     }
 
-    /// The hand's force on the block, and where it acts, from the block's middle.
+    /// A finger's force on the block, and where it acts, from the block's middle.
     fn contact(
         &self,
-        hand: Vector2<S>,
+        finger: Vector2<S>,
         velocity: Vector2<S>,
         block: Vector2<S>,
         angle: S,
@@ -92,7 +111,7 @@ impl<S: RealField + Copy> Pusher<S> {
     ) -> (Vector2<S>, Vector2<S>) {
         let number = nalgebra::convert::<f64, S>;
         let (sin, cos) = angle.sin_cos();
-        let away = hand - block;
+        let away = finger - block;
         // In the block's frame, in halves of its edge.
         let half = number(HALF);
         let p = Vector2::new(cos * away.x + sin * away.y, cos * away.y - sin * away.x) / half;
@@ -100,16 +119,16 @@ impl<S: RealField + Copy> Pusher<S> {
         let powers = p.x.powi(8) + p.y.powi(8) + number(1e-6);
         let size = powers.powf(number(0.125));
         let normal = Vector2::new(p.x.powi(7), p.y.powi(7)) * (size / powers);
-        let entered = number(HAND) - (size - S::one()) * half;
+        let entered = number(FINGER) - (size - S::one()) * half;
         let press = self.stiffness * softplus(entered, number(SOFTNESS));
         let out = Vector2::new(cos * normal.x - sin * normal.y, sin * normal.x + cos * normal.y);
         let out = out / (out.norm_squared() + number(1e-12)).sqrt();
-        let arm = away - out * number(HAND);
-        // How the hand slides over the block's side.
+        let arm = away - out * number(FINGER);
+        // How the finger slides over the block's side.
         let side = Vector2::new(-out.y, out.x);
         let surface = moving + Vector2::new(-arm.y, arm.x) * spin;
         let slip = (velocity - surface).dot(&side);
-        let drag = number(GRIP) * press * slip / (slip * slip + number(1e-4)).sqrt();
+        let drag = self.grip * press * slip / (slip * slip + number(1e-4)).sqrt();
         (side * drag - out * press, arm)
     }
 }
@@ -172,9 +191,7 @@ impl PusherTask {
 
 impl System<STATE, 2> for PusherTask {
     fn step<S: RealField + Copy>(&self, state: &SVector<S, STATE>, action: &SVector<S, 2>) -> SVector<S, STATE> {
-        let Pusher { mass, friction, stiffness } = self.pusher;
-        let [mass, friction, stiffness] = [mass, friction, stiffness].map(nalgebra::convert::<f64, S>);
-        Pusher { mass, friction, stiffness }.step(state, action)
+        self.pusher.cast().step(state, action)
     }
 
     fn cost<S: RealField + Copy>(&self, state: &SVector<S, STATE>, action: &SVector<S, 2>) -> S {

@@ -1,12 +1,15 @@
 //! The classics, to be swung up: the equations are those of [`crate::env`].
 
+use std::f64::consts::PI;
+
 use nalgebra::{RealField, SVector};
 
-use super::System;
+use super::{Habitat, System};
 use crate::env::{cartpole, pendulum};
+use crate::rng::{Rng, uniform};
 
 /// The pendulum: angle from upright and angular velocity; the action is a torque divided by 2 N m. The cost is smooth, where
-/// the environment's jumps as the angle wraps.
+/// the environment's has a kink as the angle wraps; near upright and when hanging it is much the same.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct PendulumSwing;
 
@@ -19,12 +22,23 @@ impl System<2, 1> for PendulumSwing {
     fn cost<S: RealField + Copy>(&self, state: &SVector<S, 2>, action: &SVector<S, 1>) -> S {
         let number = nalgebra::convert::<f64, S>;
         let height = S::one() - state[0].cos();
-        number(2.0) * height + number(0.1) * state[1] * state[1] + number(0.004) * action[0] * action[0]
+        number(5.0) * height + number(0.1) * state[1] * state[1] + number(0.004) * action[0] * action[0]
     }
 
     fn final_cost<S: RealField + Copy>(&self, state: &SVector<S, 2>) -> S {
         let number = nalgebra::convert::<f64, S>;
-        number(100.0) * (S::one() - state[0].cos()) + number(10.0) * state[1] * state[1]
+        number(50.0) * (S::one() - state[0].cos()) + number(5.0) * state[1] * state[1]
+    }
+}
+
+/// Sees what the environment shows, and starts as it does.
+impl Habitat<2, 1, 3> for PendulumSwing {
+    fn observe<S: RealField + Copy>(&self, state: &SVector<S, 2>) -> SVector<S, 3> {
+        SVector::from([state[0].cos(), state[0].sin(), state[1]])
+    }
+
+    fn start(&self, rng: &mut Rng) -> SVector<f64, 2> {
+        SVector::from([uniform(rng, -PI, PI), uniform(rng, -1.0, 1.0)])
     }
 }
 

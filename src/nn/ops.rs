@@ -207,27 +207,43 @@ pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<
     y.put_tape(tape)
 }
 
-/// A number for each row, `[members, batch, 1]`: `loss(row's number, row, slope)` returns it and writes its gradient with
-/// respect to the row into `slope`. Losses with a short gradient of their own are best written so.
-pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3<T> {
+/// A function of each row, `[members, batch, outputs]`: `f(row's number, row, value, jacobian)` writes its value and its Jacobian
+/// `[outputs, features]`. Whatever knows its own derivatives joins the tape here: a loss, or a simulator.
+pub fn map_rows<T: Tape<f32, Cpu>>(
+    x: Tensor3<T>,
+    outputs: usize,
+    mut f: impl FnMut(usize, &[f32], &mut [f32], &mut [f32]),
+) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(members, batch, features) = x.shape();
-    let mut slopes = vec![0.0; members * batch * features];
-    let rows = values(&x).chunks_exact(features).zip(slopes.chunks_exact_mut(features)).enumerate();
-    let losses = rows.map(|(i, (row, slope))| loss(i, row, slope)).collect();
-    let y = x.device().tensor_from_vec(losses, (members, batch, 1));
+    let mut mapped = vec![0.0; members * batch * outputs];
+    let mut jacobians = vec![0.0; mapped.len() * features];
+    let answers = mapped.chunks_exact_mut(outputs).zip(jacobians.chunks_exact_mut(outputs * features));
+    for (i, (row, (value, jacobian))) in values(&x).chunks_exact(features).zip(answers).enumerate() {
+        f(i, row, value, jacobian);
+    }
+    let y = x.device().tensor_from_vec(mapped, (members, batch, outputs));
     if T::OWNS_TAPE {
         let y = y.clone();
         tape.add_backward_op(move |gradients| {
             let dy = take(gradients, &y)?;
-            let dx = gradients.get_or_alloc_mut(&x)?;
-            for ((dx, slope), dy) in dx.chunks_exact_mut(features).zip(slopes.chunks_exact(features)).zip(dy) {
-                dx.iter_mut().zip(slope).for_each(|(dx, slope)| *dx += dy * slope);
+            let dx = gradients.get_or_alloc_mut(&x)?.chunks_exact_mut(features);
+            let jacobians = jacobians.chunks_exact(outputs * features);
+            for (dx, (jacobian, dy)) in dx.zip(jacobians.zip(dy.chunks_exact(outputs))) {
+                for (slopes, dy) in jacobian.chunks_exact(features).zip(dy) {
+                    dx.iter_mut().zip(slopes).for_each(|(dx, slope)| *dx += dy * slope);
+                }
             }
             Ok(())
         });
     }
     y.put_tape(tape)
+}
+
+/// A number for each row, `[members, batch, 1]`: `loss(row's number, row, slope)` returns it and writes its gradient with
+/// respect to the row into `slope`. Losses with a short gradient of their own are best written so.
+pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3<T> {
+    map_rows(x, 1, |i, row, value, slope| value[0] = loss(i, row, slope))
 }
 
 /// The squared distance of each row from the same row of `target`, `[members, batch, 1]`.

@@ -1,0 +1,140 @@
+//! Analytic policy gradients: a policy that learns by differentiating what it does, through the simulator, all the way.
+//!
+//! Each update runs several worlds a window of steps ahead, adds up what that costs, and goes back through simulator and
+//! network alike: the simulator's Jacobians come from dual numbers, the network's from dfdx's tape, on which both are recorded.
+//! Where a window ends, the worlds go on from there in the next one, and the gradient does not (truncation).
+
+use dfdx::prelude::*;
+use dfdx::tensor::Cpu;
+use nalgebra::SVector;
+use num_dual::Dual64;
+use serde::{Deserialize, Serialize};
+
+use super::System;
+use crate::nn::ops::{join, map_rows, record, total};
+use crate::nn::{Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Norm, Tensor3, device, tensor, values};
+use crate::rng::Rng;
+
+/// A [`System`] that a policy can live in.
+pub trait Habitat<const N: usize, const M: usize, const O: usize>: System<N, M> {
+    /// What a policy sees of a state: numbers of size one.
+    fn observe<S: nalgebra::RealField + Copy>(&self, state: &SVector<S, N>) -> SVector<S, O>;
+
+    /// A state to begin with.
+    fn start(&self, rng: &mut Rng) -> SVector<f64, N>;
+}
+
+/// Settings of a [`PolicySearch`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PolicySearchConfig {
+    /// Width of each hidden layer.
+    pub hidden: Vec<usize>,
+    /// Step size.
+    pub learning_rate: f32,
+    /// Gradients are shortened to this norm: across contact, or in a chaotic world, they explode.
+    pub max_norm: f32,
+    /// Worlds side by side.
+    pub worlds: usize,
+    /// Steps that are differentiated through.
+    pub window: usize,
+    /// Steps after which a world begins anew. Short, or the worlds of a policy that can already hold its place show it
+    /// nothing else, and it forgets how it got there.
+    pub episode: usize,
+}
+
+impl Default for PolicySearchConfig {
+    fn default() -> Self {
+        Self { hidden: vec![64, 64], learning_rate: 2e-3, max_norm: 1.0, worlds: 4, window: 32, episode: 64 }
+    }
+}
+
+/// A policy and the worlds that it learns in.
+pub struct PolicySearch<const N: usize, const M: usize, const O: usize> {
+    config: PolicySearchConfig,
+    policy: Mlp,
+    optimiser: Adam,
+    /// Each world's state and age, steps.
+    worlds: Vec<(SVector<f64, N>, usize)>,
+    /// Steps simulated so far.
+    pub steps: usize,
+}
+
+impl<const N: usize, const M: usize, const O: usize> PolicySearch<N, M, O> {
+    /// A policy that does next to nothing yet.
+    pub fn new(system: &impl Habitat<N, M, O>, config: PolicySearchConfig, rng: &mut Rng) -> Self {
+        let shape = MlpConfig {
+            members: 1,
+            input: O,
+            hidden: config.hidden.clone(),
+            output: Some(M),
+            norm: Norm::None,
+            activation: Activation::Silu,
+            init: Init::TruncatedNormal,
+        };
+        let optimiser = AdamConfig { max_norm: Some(config.max_norm), ..AdamConfig::new(config.learning_rate) };
+        // Of different ages, so that they do not all begin anew at once.
+        let apart = config.episode / config.worlds;
+        Self {
+            policy: Mlp::new(&device(), &shape, rng).scale_output(0.1),
+            optimiser: Adam::new(optimiser),
+            worlds: (0..config.worlds).map(|i| (system.start(rng), i * apart)).collect(),
+            steps: 0,
+            config,
+        }
+    }
+
+    /// What the policy does.
+    pub fn act(&self, observation: &SVector<f32, O>) -> SVector<f32, M> {
+        let seen = tensor(&device(), observation.as_slice().to_vec(), (1, 1, O));
+        SVector::from_column_slice(values(&self.policy.forward(seen, Learning::Frozen).tanh()))
+    }
+
+    /// One gradient step. Returns what a step has cost on average.
+    pub fn update(&mut self, system: &impl Habitat<N, M, O>, rng: &mut Rng) -> f32 {
+        let PolicySearchConfig { window, episode, .. } = self.config;
+        for (state, age) in self.worlds.iter_mut().filter(|(_, age)| *age >= episode) {
+            (*state, *age) = (system.start(rng), 0);
+        }
+        let states = self.worlds.iter().flat_map(|(state, _)| state.iter().map(|x| *x as f32)).collect();
+        let mut state = tensor(&device(), states, (1, self.worlds.len(), N));
+        let (mut tape, mut costs) = (OwnedTape::default(), Vec::with_capacity(window));
+        for _ in 0..window {
+            let observe = |x: &[Dual64]| system.observe(&part(x)).as_slice().to_vec();
+            let seen = record(&mut tape, &state, |state| simulated(state, O, observe));
+            let action = record(&mut tape, &seen, |seen| self.policy.forward(seen, Learning::Trained).tanh());
+            let both = record(&mut tape, &state, |state| join(state, action));
+            let cost = |x: &[Dual64]| vec![system.cost(&part(&x[..N]), &part(&x[N..]))];
+            costs.push((1.0 / window as f32, record(&mut tape, &both, |both| simulated(both, 1, cost))));
+            let step = |x: &[Dual64]| system.step(&part(&x[..N]), &part(&x[N..])).as_slice().to_vec();
+            state = record(&mut tape, &both, |both| simulated(both, N, step));
+        }
+        let loss = total(tape, &costs);
+        let cost = loss.array();
+        self.optimiser.step(&mut self.policy, &mut loss.backward());
+        for ((old, age), new) in self.worlds.iter_mut().zip(values(&state).chunks_exact(N)) {
+            (*old, *age) = (SVector::from_fn(|i, _| f64::from(new[i])), *age + window);
+        }
+        self.steps += self.worlds.len() * window;
+        cost
+    }
+}
+
+fn part<const N: usize>(x: &[Dual64]) -> SVector<Dual64, N> {
+    SVector::from_column_slice(x)
+}
+
+/// A function of the simulator's, of each row. Its Jacobian: a dual number in each input by turns.
+fn simulated<T: Tape<f32, Cpu>>(x: Tensor3<T>, outputs: usize, f: impl Fn(&[Dual64]) -> Vec<Dual64>) -> Tensor3<T> {
+    map_rows(x, outputs, |_, row, value, jacobian| {
+        let mut inputs: Vec<Dual64> = row.iter().map(|x| Dual64::from_re(f64::from(*x))).collect();
+        for i in 0..inputs.len() {
+            inputs[i].eps = 1.0;
+            for (j, output) in f(&inputs).into_iter().enumerate() {
+                value[j] = output.re as f32;
+                jacobian[j * inputs.len() + i] = output.eps as f32;
+            }
+            inputs[i].eps = 0.0;
+        }
+    })
+}
