@@ -179,20 +179,20 @@ fn mass_and_friction_are_found_again() {
     assert!(found.residual < 1e-5, "{found:?}");
 }
 
-/// The best of a few first guesses, and a little better at every step: the environment's own pendulum is swung up, whatever it
+/// The best of many first guesses, and a little better at every step: the environment's own pendulum is swung up, whatever it
 /// starts from.
 #[test]
 fn ilqr_controls_the_environment_with_a_receding_horizon() {
     const EPISODES: u64 = 20;
-    let ilqr = Ilqr::new(IlqrConfig { iterations: 50, tolerance: 1e-4, ..IlqrConfig::default() });
+    let ilqr = Ilqr::new(IlqrConfig { iterations: 20, tolerance: 1e-4, ..IlqrConfig::default() });
     let mut world = Pendulum::default();
     let (mut total, mut steps) = (0.0, 0);
     for episode in 0..EPISODES {
         world.reset(episode);
         let state = |world: &Pendulum| SVector::from([world.snapshot().angle, world.snapshot().speed]);
         let mut rng = rng::stream(episode, "ilqr");
-        let guesses = (0..8).map(|_| {
-            let noise = ColoredNoise::new(2.0, 40).sample_actions(1, &mut rng);
+        let guesses = (0..32).map(|_| {
+            let noise = ColoredNoise::new(2.0, 50).sample_actions(1, &mut rng);
             ilqr.solve(
                 &PendulumSwing,
                 &state(&world),
@@ -212,7 +212,7 @@ fn ilqr_controls_the_environment_with_a_receding_horizon() {
         }
     }
     println!("mean return {total:.1}, {} simulated steps an action", steps / (200 * EPISODES as usize));
-    assert!(total > -160.0, "{total}");
+    assert!(total > -170.0, "{total}");
 }
 
 /// Through network and simulator at once, a policy learns in seconds what takes SAC most of a minute; though in more steps.
