@@ -6,6 +6,7 @@
 //! | --- | --- | --- |
 //! | 3 | [`study`] | runs, the protocol by which agents are judged, tables, figures, reports |
 //! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
+//! | 3 | `chart` | charts for chapters and examples (feature `figures`) |
 //! | 2 | [`agent`] | agents: the wiring of what stands below |
 //! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradients: optimisers of a closure over action sequences |
 //! | 1 | [`model`] | what was learned of the world: probabilistic ensembles, latent worlds, and imagination in both |
@@ -66,6 +67,8 @@
 #![warn(missing_docs)]
 
 pub mod agent;
+#[cfg(feature = "figures")]
+pub mod chart;
 pub mod diff;
 pub mod env;
 pub mod error;

@@ -8,21 +8,10 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::tables::Tables;
+use crate::chart::{FONT, GREY, PALETTE};
 use crate::error::{Error, Result};
 use crate::files;
 
-/// Colours that stay apart for colour-blind readers (Okabe and Ito).
-const PALETTE: [RGBColor; 7] = [
-    RGBColor(0, 114, 178),
-    RGBColor(213, 94, 0),
-    RGBColor(0, 158, 115),
-    RGBColor(204, 121, 167),
-    RGBColor(230, 159, 0),
-    RGBColor(86, 180, 233),
-    RGBColor(0, 0, 0),
-];
-const FONT: &str = "sans-serif";
-const GREY: RGBColor = RGBColor(110, 110, 110);
 const SIZE: (u32, u32) = (820, 440);
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;

@@ -136,6 +136,15 @@ impl Recording {
         page
     }
 
+    /// Shows it in a notebook, in a frame of its own; called by the kernel.
+    pub fn evcxr_display(&self) {
+        // In an attribute, on one line.
+        let page = self.to_html().replace('&', "&amp;").replace('"', "&quot;").replace('\n', "&#10;");
+        println!(
+            "EVCXR_BEGIN_CONTENT text/html\n<iframe class=\"replay\" title=\"3D replay\" loading=\"lazy\" style=\"width:100%;height:440px;border:0\" srcdoc=\"{page}\"></iframe>\nEVCXR_END_CONTENT"
+        );
+    }
+
     /// Writes the page.
     ///
     /// # Errors

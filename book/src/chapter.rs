@@ -1,0 +1,107 @@
+//! A chapter, as people write it: Markdown in which every fence ` ```rust ` is a cell. Cells share their state, as in a notebook.
+//! A fence with anything behind the word (` ```rust,ignore `) is only shown.
+
+use std::io::{self, Error, ErrorKind};
+use std::path::Path;
+
+/// A chapter and its parts.
+#[derive(Clone, Debug)]
+pub struct Chapter {
+    /// The file's name without `.md`: `01-hand`.
+    pub name: String,
+    /// Text and cells, in order.
+    pub parts: Vec<Part>,
+    lines: usize,
+}
+
+/// A stretch of a chapter.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Markdown.
+    Text(String),
+    /// Code that runs.
+    Cell {
+        /// The code, without its fence.
+        code: String,
+        /// The line on which the code begins, from 1.
+        line: usize,
+        /// Whether it is the solution of an exercise, and folded.
+        folded: bool,
+    },
+}
+
+impl Chapter {
+    /// All chapters of a folder, in the order of their names. `SUMMARY.md` is not one.
+    ///
+    /// # Errors
+    /// If a file cannot be read, or a fence is not closed.
+    pub fn all(folder: &Path) -> io::Result<Vec<Self>> {
+        let mut chapters = Vec::new();
+        for entry in std::fs::read_dir(folder)? {
+            let path = entry?.path();
+            let name = path.file_stem().and_then(|name| name.to_str()).unwrap_or_default();
+            if path.extension().is_some_and(|kind| kind == "md") && name != "SUMMARY" {
+                chapters.push(Self::parse(name, &std::fs::read_to_string(&path)?)?);
+            }
+        }
+        chapters.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(chapters)
+    }
+
+    /// Takes a chapter apart.
+    ///
+    /// # Errors
+    /// If a fence is not closed.
+    pub fn parse(name: &str, text: &str) -> io::Result<Self> {
+        let mut parts = Vec::new();
+        let mut prose = String::new();
+        let mut folded = false;
+        let mut lines = text.lines().enumerate();
+        while let Some((at, line)) = lines.next() {
+            if !line.starts_with("```") {
+                folded = (folded || line.starts_with("<details")) && !line.starts_with("</details");
+                prose += line;
+                prose.push('\n');
+                continue;
+            }
+            let mut fence = String::new();
+            loop {
+                let Some((_, inside)) = lines.next() else {
+                    let message = format!("chapters/{name}.md:{}: this fence is not closed", at + 1);
+                    return Err(Error::new(ErrorKind::InvalidData, message));
+                };
+                if inside == "```" {
+                    break;
+                }
+                fence += inside;
+                fence.push('\n');
+            }
+            if line == "```rust" {
+                parts.push(Part::Text(std::mem::take(&mut prose)));
+                parts.push(Part::Cell { code: fence, line: at + 2, folded });
+            } else {
+                prose += &format!("{line}\n{fence}```\n");
+            }
+        }
+        parts.push(Part::Text(prose));
+        parts.retain(|part| !matches!(part, Part::Text(text) if text.trim().is_empty()));
+        Ok(Self { name: name.into(), parts, lines: text.lines().count() })
+    }
+
+    /// One program of all cells, each on its own lines. A cell's last expression shows itself in a notebook; here it becomes a
+    /// statement.
+    pub fn program(&self) -> String {
+        let mut lines = vec![String::new(); self.lines.max(1) + 1];
+        lines[0] = "pub fn run() -> std::result::Result<(), Box<dyn std::error::Error>> {".into();
+        for part in &self.parts {
+            let Part::Cell { code, line, .. } = part else { continue };
+            for (i, code) in code.lines().enumerate() {
+                lines[line - 1 + i] = code.into();
+            }
+            // On the line of the closing fence, where no comment can swallow it.
+            lines[line - 1 + code.lines().count()] = ";".into();
+        }
+        lines[self.lines.max(1)] = "Ok(()) }".into();
+        lines.join("\n") + "\n"
+    }
+}
