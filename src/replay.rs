@@ -195,6 +195,27 @@ pub struct Sequences {
     pub terminal: Vec<bool>,
 }
 
+impl Sequences {
+    /// The last `moments` of each stretch.
+    pub fn last(&self, moments: usize) -> Self {
+        let rows = moments * self.sequences;
+        fn end<T: Clone>(all: &[T], rows: usize, of: usize) -> Vec<T> {
+            all[all.len() - all.len() / of * rows..].to_vec()
+        }
+        let of = self.length * self.sequences;
+        Self {
+            sequences: self.sequences,
+            length: moments,
+            obs: end(&self.obs, rows, of),
+            actions: end(&self.actions, rows, of),
+            rewards: end(&self.rewards, rows, of),
+            first: end(&self.first, rows, of),
+            last: end(&self.last, rows, of),
+            terminal: end(&self.terminal, rows, of),
+        }
+    }
+}
+
 /// All experience, in the order of time.
 #[derive(Clone, Debug)]
 pub struct SequenceReplay {

@@ -228,7 +228,9 @@ fn gradients_of_imagined_returns_are_exact() {
     assert!(learned.predicts_reward() && !known.predicts_reward());
     let actions: Vec<f32> = (0..12).map(|i| 0.8 * (i as f32).sin()).collect();
     let obs = seen(0.2, -0.1);
-    for (dynamics, reward) in [(&known, Reward::Known(&Reach)), (&learned, Reward::Learned)] {
+    let gated = fitted(EnsembleConfig { gated: true, ..config() }).dynamics();
+    let known_reward = Reward::Known(&Reach);
+    for (dynamics, reward) in [(&known, known_reward), (&gated, known_reward), (&learned, Reward::Learned)] {
         let model = Differentiable::new(dynamics);
         for caution in [0.0, 0.5] {
             let (returns, slopes) = model.gradients(reward, &obs, &actions, 6, caution);
@@ -262,4 +264,47 @@ fn rewards_can_be_learned() {
     for (known, learned) in known.iter().zip(&learned) {
         assert!((known - learned).abs() < 0.15, "{learned} learned, {known} known");
     }
+}
+
+/// A hand, and a block that it pushes along when it runs into it from the left: how far do models let the block creep where
+/// nobody touches it?
+#[test]
+fn gates_keep_still_what_nobody_touches() {
+    let features = vec![
+        Feature::new("hand"),
+        Feature::new("block"),
+        Feature::new("hand to block").around(0.0, 0.2).difference("block", "hand"),
+    ];
+    let spec = Spec { observation: features, ..spec() };
+    let seen = |hand: f32, block: f32| vec![hand, block, block - hand];
+    let step = |obs: &[f32], action: f32| {
+        let (hand, block) = (obs[0] + 0.1 * action, obs[1]);
+        seen(hand, if obs[0] <= block { block.max(hand) } else { block })
+    };
+    let mut rng = rng::stream(7, "model");
+    let mut anywhere = || rng::uniform(&mut rng, -1.0, 1.0) as f32;
+    let mut data = ReplayBuffer::new(3, 1, 3000);
+    for _ in 0..3000 {
+        let (obs, action) = (seen(anywhere(), anywhere()), vec![anywhere()]);
+        let next_obs = step(&obs, action[0]);
+        data.push(&Transition { obs, action, reward: 0.0, next_obs, terminated: false, truncated: false });
+    }
+    let untouched: Vec<(Vec<f32>, f32)> = (0..500)
+        .map(|_| (seen(anywhere(), anywhere()), anywhere()))
+        .filter(|(obs, action)| step(obs, *action)[1] == obs[1])
+        .collect();
+    let creeping = |gated: bool| {
+        let mut rng = rng::stream(8, "model");
+        let mut ensemble =
+            Ensemble::new(&spec, EnsembleConfig { gated, ..config() }, &mut rng).expect("usable settings");
+        ensemble.fit(&data, &mut rng);
+        let dynamics = ensemble.dynamics();
+        let creep =
+            |(obs, action): &(Vec<f32>, f32)| (dynamics.predict(obs, &[*action]).mean[1] - f64::from(obs[1])).abs();
+        let mut creeps: Vec<f64> = untouched.iter().map(creep).collect();
+        creeps.sort_by(f64::total_cmp);
+        creeps[creeps.len() / 2]
+    };
+    let (plain, gated) = (creeping(false), creeping(true));
+    assert!(gated < 0.3 * plain, "it creeps by {gated:.6} with gates, by {plain:.6} without");
 }

@@ -178,6 +178,7 @@ fn gradients_of_rows() {
         let (x, tape) = x.split_tape();
         ops::stack(tape, &[x, other.clone()])
     });
+    check_operation!(vec![random((2, 4, 6), &mut rng::stream(11, "gates"))], |x, []| ops::gated(x));
 }
 
 #[test]

@@ -23,6 +23,7 @@ pub struct Differentiable {
     /// What is read through a tanh: into it, and out of it.
     near: Option<[Fixed; 2]>,
     networks: Mlp,
+    gated: bool,
     exit: Fixed,
     members: usize,
     observation: usize,
@@ -92,6 +93,7 @@ impl Differentiable {
                 [Fixed::new(&cpu, members, &approach, &vec![0.0; near]), Fixed::new(&cpu, members, &close, &unshifted)]
             }),
             networks: dynamics.networks(&cpu),
+            gated: dynamics.gated(),
             exit: Fixed::new(&cpu, members, &exit, &bias),
             members,
             observation: width,
@@ -135,6 +137,7 @@ impl Differentiable {
         for action in &step_actions {
             let input = ops::join(state.clone().put_tape(tape), action.clone());
             let head = self.networks.forward(self.read(input), Learning::Frozen);
+            let head = if self.gated { ops::gated(head) } else { head };
             let changes = head.slice((.., .., ..self.outputs));
             let (changes, so_far) = changes.split_tape();
             let (after, so_far) = self.exit.forward(ops::join(state.clone().put_tape(so_far), changes)).split_tape();

@@ -5,7 +5,7 @@ use dfdx::tensor::Cpu;
 use super::uncertainty::split;
 use super::{Layout, Normaliser};
 use crate::nn::kernels::{self, Matrix, vectorised_fn};
-use crate::nn::{Activation, Mlp, bounded};
+use crate::nn::{Activation, Mlp, bounded, ops};
 
 /// Elites of an ensemble, frozen. All predictions are in physical units unless said otherwise.
 #[derive(Clone, Debug)]
@@ -128,6 +128,11 @@ impl Dynamics {
         self.targets.mean.len()
     }
 
+    /// Whether the networks have a gate for each mean, behind mean and log-variance.
+    pub(super) fn gated(&self) -> bool {
+        self.members[0].last().is_some_and(|head| head.bias.len() > 2 * self.outputs())
+    }
+
     /// What one member says of the given rows of states and actions, `[rows, 2 outputs]`: changes, and then standard
     /// deviations.
     pub(super) fn ask<'a>(
@@ -158,6 +163,9 @@ impl Dynamics {
             let activation = if i + 1 < layers.len() { Activation::Silu } else { Activation::Identity };
             kernels::add_and_activate(y, bias, activation);
             std::mem::swap(x, y);
+        }
+        if self.gated() {
+            ops::gate_rows(x, self.outputs());
         }
         let Normaliser { mean, scale } = &self.targets;
         let [max, min] = &self.bounds;

@@ -20,7 +20,7 @@ use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::{
     Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Norm, Parameters, Tensor3,
-    Weights, bounded_nll, device, tensor, values,
+    Weights, bounded_nll, device, ops, tensor, values,
 };
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
@@ -72,6 +72,9 @@ pub struct EnsembleConfig {
     pub max_target: f32,
     /// Whether the reward is learned too; otherwise it must be known.
     pub learn_reward: bool,
+    /// Whether each change is a size times a gate (a sigmoid with an output of its own), which can be shut over whole
+    /// regions: a cube that nobody touches stays where it is. Without, it creeps a little, and plans make use of that.
+    pub gated: bool,
 }
 
 impl Default for EnsembleConfig {
@@ -93,6 +96,7 @@ impl Default for EnsembleConfig {
             beta: 0.5,
             max_target: 10.0,
             learn_reward: false,
+            gated: false,
         }
     }
 }
@@ -164,7 +168,7 @@ impl Ensemble {
             members: config.members,
             input: inputs,
             hidden: config.hidden.clone(),
-            output: Some(2 * outputs),
+            output: Some(if config.gated { 3 } else { 2 } * outputs),
             norm: Norm::None,
             activation: Activation::Silu,
             init: Init::TruncatedNormal,
@@ -273,6 +277,10 @@ impl Ensemble {
             self.layout.predicted.iter().map(still).chain(self.config.learn_reward.then_some(STILL)).collect();
         self.inputs = Normaliser::fit(&inputs, &of_inputs);
         self.targets = Normaliser::fit(&targets, &of_targets);
+        if self.config.gated {
+            // A shut gate means no change, not the usual one.
+            self.targets.mean.fill(0.0);
+        }
         self.inputs.normalise(&mut inputs);
         self.targets.normalise(&mut targets);
         let most = self.config.max_target;
@@ -287,13 +295,19 @@ impl Ensemble {
         let shape = |width| (self.config.members, batch, width);
         let x = tensor(&self.cpu, gather(&data.inputs, &rows, data.rows), shape(data.inputs.len() / data.rows));
         let y = tensor(&self.cpu, gather(&data.targets, &rows, data.rows), shape(data.targets.len() / data.rows));
-        let head = self.learner.networks.forward(x.leaky_traced(), Learning::Trained);
+        let head = self.head(x.leaky_traced(), Learning::Trained);
         let learning = if self.config.learn_bounds { Learning::Trained } else { Learning::Frozen };
         let loss = bounded_nll(head, &y, &self.learner.bounds, self.config.beta, learning);
         let answer = values(&loss)[0];
         let mut gradients = loss.sum().backward();
         self.optimiser.step(&mut self.learner, &mut gradients);
         answer
+    }
+
+    /// Means and raw log-variances, `[members, batch, 2 outputs]`.
+    fn head<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Learning) -> Tensor3<T> {
+        let head = self.learner.networks.forward(x, learning);
+        if self.config.gated { ops::gated(head) } else { head }
     }
 
     /// Mean squared error of each network's mean on the given rows, in normalised units.
@@ -339,7 +353,7 @@ impl Ensemble {
     fn judged(&self, data: &Data, rows: &[usize]) -> (Vec<f32>, Vec<f32>) {
         let inputs = gather(&data.inputs, rows, data.rows);
         let x = tensor(&self.cpu, inputs, (1, rows.len(), data.inputs.len() / data.rows));
-        let head = self.learner.networks.forward(x, Learning::Frozen);
+        let head = self.head(x, Learning::Frozen);
         (values(&head).to_vec(), gather(&data.targets, rows, data.rows))
     }
 

@@ -98,6 +98,12 @@ impl Latent {
         }
     }
 
+    /// The beliefs of the last `count` rows.
+    pub fn last(&self, count: usize) -> Self {
+        let last = |x: &Tensor3| ops::rows(x.clone(), x.shape().1 - count, count);
+        Self { memory: last(&self.memory), state: last(&self.state) }
+    }
+
     /// The belief of one row, `times` times.
     pub fn repeated(&self, row: usize, times: usize) -> Self {
         let repeat = |x: &Tensor3| {

@@ -240,6 +240,46 @@ pub fn map_rows<T: Tape<f32, Cpu>>(
     y.put_tape(tape)
 }
 
+/// Gates what stands in the first third of each row, `[members, batch, 3 n]`, by the sigmoid of what stands in the last; the
+/// second stays as it is: `[members, batch, 2 n]`.
+pub fn gated<T: Tape<f32, Cpu>>(x: Tensor3<T>) -> Tensor3<T> {
+    let (x, mut tape) = x.split_tape();
+    let &(members, batch, width) = x.shape();
+    let n = width / 3;
+    let mut rows = values(&x).to_vec();
+    gate_rows(&mut rows, n);
+    let y = x.device().tensor_from_vec(rows, (members, batch, 2 * n));
+    if T::OWNS_TAPE {
+        let y = y.clone();
+        tape.add_backward_op(move |gradients| {
+            let dy = take(gradients, &y)?;
+            let dx = gradients.get_or_alloc_mut(&x)?.chunks_exact_mut(width);
+            for ((row, dx), dy) in values(&x).chunks_exact(width).zip(dx).zip(dy.chunks_exact(2 * n)) {
+                for i in 0..n {
+                    let open = kernels::sigmoid(row[2 * n + i]);
+                    dx[i] += dy[i] * open;
+                    dx[n + i] += dy[n + i];
+                    dx[2 * n + i] += dy[i] * row[i] * open * (1.0 - open);
+                }
+            }
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// The same for plain rows, in place: `3 n` numbers each become `2 n`.
+pub fn gate_rows(rows: &mut Vec<f32>, n: usize) {
+    let count = rows.len() / (3 * n);
+    for row in 0..count {
+        // What is read has not been written over yet: rows only move towards the front.
+        let (from, to) = (3 * n * row, 2 * n * row);
+        (0..n).for_each(|i| rows[to + i] = rows[from + i] * kernels::sigmoid(rows[from + 2 * n + i]));
+        rows.copy_within(from + n..from + 2 * n, to + n);
+    }
+    rows.truncate(2 * n * count);
+}
+
 /// A number for each row, `[members, batch, 1]`: `loss(row's number, row, slope)` returns it and writes its gradient with
 /// respect to the row into `slope`. Losses with a short gradient of their own are best written so.
 pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3<T> {

@@ -9,7 +9,7 @@ use super::returns::{lambda_returns, replayed_returns};
 use crate::agent::Losses;
 use crate::error::{Error, Result};
 use crate::model::rssm::layers_of;
-use crate::model::{Latent, Lesson, WorldModel};
+use crate::model::{Latent, WorldModel};
 use crate::nn::ops::{self, record};
 use crate::nn::{BoundedNormal, Learning, Mlp, Tensor3, copy_parameters, parameters_of_fields, polyak, tensor, values};
 use crate::replay::Sequences;
@@ -230,18 +230,18 @@ impl ActorCritic {
     }
 
     /// The critic's loss on what was experienced, whose gradient flows into the beliefs too: they learn to tell what
-    /// matters. `beyond` is what dreams from each moment are worth.
+    /// matters. `features` are what is believed at each moment of the batch, `beyond` what dreams from there are worth.
     pub fn replayed_loss<T: Tape<f32, Cpu>>(
         &self,
         tape: &mut T,
         world: &WorldModel,
         slow: &SlowCritic,
         batch: &Sequences,
-        lesson: &Lesson,
+        features: &Tensor3,
         beyond: &[f32],
     ) -> (f32, Tensor3) {
         let (returns, counts) = replayed_returns(batch, beyond, world.config().discount(), self.config.lambda);
-        let known = record(tape, &lesson.features, |features| ops::rows(features, 0, returns.len()));
+        let known = record(tape, features, |features| ops::rows(features, 0, returns.len()));
         let steady = world.bins().read(&slow.forward(known.clone(), Learning::Frozen));
         let loss = record(tape, &known, |known| {
             let logits = self.critic.forward(known, Learning::Trained);

@@ -23,7 +23,8 @@ use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::open_loop::{OpenLoop, Trace, open_loop};
 use crate::model::{Latent, WorldModel, WorldModelConfig};
-use crate::nn::{Adam, AdamConfig, Parameters, Weights, ops, parameters_of_fields, tensor};
+use crate::nn::ops::{self, record};
+use crate::nn::{Adam, AdamConfig, Parameters, Weights, parameters_of_fields, tensor};
 use crate::plan::{ControlConfig, PlannerConfig, RecedingHorizon};
 use crate::replay::{SequenceReplay, Sequences, Transition};
 use crate::rng::{self, Rng};
@@ -54,6 +55,9 @@ pub struct DreamerConfig {
     pub batch: usize,
     /// Moments in each.
     pub length: usize,
+    /// Moments of each from which it dreams: the last ones, which have the most to look back on; from all if left out.
+    /// Dreams are what costs most.
+    pub dreams: Option<usize>,
     /// Moments that are learned from for each moment that is lived through.
     pub train_ratio: f32,
     /// Random steps before the first update.
@@ -76,6 +80,7 @@ impl Default for DreamerConfig {
             learning_warm_up: 1000,
             batch: 16,
             length: 64,
+            dreams: None,
             train_ratio: 1024.0,
             warm_up: 1024,
             warm_up_colour: 0.0,
@@ -95,6 +100,9 @@ impl DreamerConfig {
             return Err(Error::BadSetting(format!(
                 "dreamer: `batch` must be a multiple of {PARTS}, `length` at least 2"
             )));
+        }
+        if self.dreams.is_some_and(|dreams| dreams < 2 || dreams > self.length) {
+            return Err(Error::BadSetting("dreamer: `dreams` must lie between 2 and `length`".into()));
         }
         if self.warm_up <= self.length || self.train_ratio <= 0.0 {
             return Err(Error::BadSetting(
@@ -194,7 +202,8 @@ impl Dreamer {
             .map(|_| (self.replay.sample(batch / PARTS, length, &mut self.rng), rng::fork(&mut self.rng)))
             .collect();
         let networks = &self.networks;
-        let parts: Vec<Part> = shares.into_par_iter().map(|(batch, rng)| networks.study(&batch, rng)).collect();
+        let dreams = self.config.dreams.unwrap_or(length);
+        let parts: Vec<Part> = shares.into_par_iter().map(|(batch, rng)| networks.study(&batch, dreams, rng)).collect();
         let mut returns: Vec<f32> = parts.iter().flat_map(|part| part.dream.returns.concat()).collect();
         self.scale.update(&mut returns);
         let scale = self.scale.scale();
@@ -221,13 +230,19 @@ impl Dreamer {
 }
 
 impl Networks {
-    /// The first half of a part of an update: the world model's losses, and dreams of where its beliefs may lead.
-    fn study(&self, batch: &Sequences, mut rng: Rng) -> Part {
+    /// The first half of a part of an update: the world model's losses, and dreams of where its last beliefs may lead.
+    fn study(&self, batch: &Sequences, dreams: usize, mut rng: Rng) -> Part {
         let Self { world, behaviour, slow } = self;
         let mut tape = OwnedTape::default();
         let lesson = world.lesson(&mut tape, batch, &mut rng);
-        let dream = behaviour.dream(world, &lesson.latent, &mut rng);
-        let replayed = behaviour.replayed_loss(&mut tape, world, slow, batch, &lesson, &dream.returns[0]);
+        let batch = batch.last(dreams);
+        let rows = dreams * batch.sequences;
+        let dream = behaviour.dream(world, &lesson.latent.last(rows), &mut rng);
+        let last = record(&mut tape, &lesson.features, |all| {
+            let count = all.shape().1;
+            ops::rows(all, count - rows, rows)
+        });
+        let replayed = behaviour.replayed_loss(&mut tape, world, slow, &batch, &last, &dream.returns[0]);
         let mut losses: Losses = lesson.losses.iter().map(|(name, _, loss)| (*name, ops::mean(loss))).collect();
         losses.insert("replayed_value", ops::mean(&replayed.1));
         losses.insert("posterior_entropy", lesson.entropies[0]);
