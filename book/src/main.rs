@@ -51,6 +51,9 @@ fn main() -> Result<()> {
 
 // Pages.
 
+/// What formulas are set in, beside the book's settings and beside its pages.
+const FONT: &str = "fonts/stix-two-math.woff2";
+
 /// Splices answers, formulas and pictures into the chapters.
 struct Splice {
     pages: BTreeMap<String, String>,
@@ -93,6 +96,7 @@ fn build(root: &Path) -> Result<()> {
         fs::create_dir_all(to.parent().context("a folder")?)?;
         fs::copy(root.join(&picture), &to).with_context(|| format!("{}: a chapter shows it", picture.display()))?;
     }
+    fs::copy(root.join("book").join(FONT), out.join(FONT)).context(FONT)?;
     let broken = links::broken(&out)?;
     if !broken.is_empty() {
         bail!("{} broken links:\n{}", broken.len(), broken.join("\n"));

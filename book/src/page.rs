@@ -113,7 +113,9 @@ fn mathml(latex: &str, display_mode: DisplayMode) -> anyhow::Result<String> {
     let events = events.map_err(|error| anyhow::anyhow!("the formula `{latex}`: {error}"))?;
     let mut html = String::new();
     push_mathml(&mut html, events.into_iter().map(Ok::<_, std::convert::Infallible>), config)?;
-    Ok(html.replace('\n', " "))
+    // What means something to Markdown must not: two tildes would strike out what stands between.
+    let escapes = [("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")];
+    Ok(escapes.into_iter().fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
 }
 
 #[cfg(test)]
@@ -126,6 +128,8 @@ mod tests {
         assert!(page.contains("<math") && page.contains("`$code$`") && page.contains("$HOME") && page.contains("$5."));
         assert_eq!(page.matches("<math").count(), 2);
         assert!(formulas("$\\frac{1$").is_err(), "a formula that is not closed");
+        let tildes = formulas("$\\tilde a + \\tilde b$").expect("a formula");
+        assert!(!tildes.contains('~') && tildes.contains("&#126;"), "{tildes}");
     }
 
     #[test]
