@@ -3,7 +3,7 @@
 use crate::plan::noise::ColoredNoise;
 use crate::rng::Rng;
 
-/// Coloured noise, an episode's worth at a time.
+/// Coloured noise, an episode's worth at a time: actions by itself, or what moves a policy's actions about their mean.
 pub(super) struct RandomActions {
     noise: ColoredNoise,
     /// Numbers in an action.
@@ -25,9 +25,13 @@ impl RandomActions {
 
     /// The next action, each number in [-1, 1].
     pub(super) fn next(&mut self, rng: &mut Rng) -> Vec<f32> {
+        self.deviates(rng).into_iter().map(|a| a.clamp(-1.0, 1.0)).collect()
+    }
+
+    /// The same, not clamped: each number by itself is standard normal.
+    pub(super) fn deviates(&mut self, rng: &mut Rng) -> Vec<f32> {
         if self.ahead.is_empty() {
-            let actions = self.noise.sample_actions(self.size, rng);
-            self.ahead = actions.iter().map(|a| a.clamp(-1.0, 1.0) as f32).collect();
+            self.ahead = self.noise.sample_actions(self.size, rng).iter().map(|a| *a as f32).collect();
         }
         self.ahead.drain(..self.size).collect()
     }

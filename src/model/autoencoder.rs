@@ -47,13 +47,14 @@ impl Autoencoder {
     pub fn new(spec: &Spec, config: &AutoencoderConfig, rng: &mut Rng) -> Self {
         let cpu = device();
         let AutoencoderConfig { code, hidden } = config;
+        let view = View::new(spec);
         let mut mlp = |input, output| layers_of(&cpu, input, hidden, Some(output), rng);
         Self {
-            encoder: mlp(spec.observation_size(), *code),
-            decoder: mlp(*code, spec.observation_size()),
+            encoder: mlp(view.width(), *code),
+            decoder: mlp(*code, view.width()),
             // At first, nothing moves.
             dynamics: mlp(code + spec.action_size, *code).scale_output(0.0),
-            view: View::new(spec),
+            view,
             cpu,
         }
     }

@@ -123,14 +123,15 @@ impl WorldModel {
         let cpu = device();
         let hidden = vec![config.units; config.layers];
         let features = config.rssm.features();
+        let view = View::new(spec);
         let mut mlp = |input, hidden: &[usize], output| layers_of(&cpu, input, hidden, output, rng);
-        let encoder = mlp(spec.observation_size(), &hidden, None);
-        let decoder = mlp(features, &hidden, Some(spec.observation_size()));
+        let encoder = mlp(view.width(), &hidden, None);
+        let decoder = mlp(features, &hidden, Some(view.width()));
         let reward = mlp(features, &hidden[..1], Some(config.bins)).scale_output(0.0);
         let continues = mlp(features, &hidden[..1], Some(1));
         Self {
             rssm: Rssm::new(&cpu, &config.rssm, spec.action_size, config.units, rng),
-            view: View::new(spec),
+            view,
             bins: SymexpBins::new(config.bins, config.bin_limit),
             config: config.clone(),
             cpu,

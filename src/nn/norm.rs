@@ -4,8 +4,8 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
 use super::kernels::{Activation, silu, silu_slope, vectorised_fn};
-use super::layers::Parameters;
 use super::ops::{Learning, Tensor3, take, values};
+use super::parameters::Parameters;
 
 /// Layer normalisation (Ba et al. 2016), then the activation:
 /// `activation(gain (x - mean) / sqrt(variance + 1e-5) + shift)`; gain and shift `[members, 1, features]`.

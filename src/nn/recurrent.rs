@@ -5,8 +5,9 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
 use super::kernels::{self, Matrix, sigmoid, tanh, vectorised_fn};
-use super::layers::{Init, Parameters};
+use super::layers::Init;
 use super::ops::{Tensor3, take, values};
+use super::parameters::Parameters;
 use crate::rng::Rng;
 
 /// An affine layer whose weight is block-diagonal, and which may add a full layer of a second input:

@@ -13,7 +13,8 @@ pub fn wilson(successes: usize, n: usize) -> [f64; 2] {
     let (n, p) = (n as f64, successes as f64 / n as f64);
     let centre = (p + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
     let half = Z / (1.0 + Z * Z / n) * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-    [centre - half, centre + half]
+    // In exact arithmetic neither end ever leaves [0, 1].
+    [(centre - half).max(0.0), (centre + half).min(1.0)]
 }
 
 /// The mean of the middle half: a quarter of the values, rounded down, is dropped at each end.

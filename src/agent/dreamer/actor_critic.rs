@@ -116,24 +116,16 @@ impl ActorCritic {
         BoundedNormal::new(head[i], head[self.actions + i], self.config.min_std)
     }
 
-    /// The policy's mean actions, `[rows, actions]`.
-    pub fn best(&self, features: &Tensor3) -> Vec<f32> {
+    /// The policy's mean actions, `[rows, actions]`; or those that lie `noise` (of the same form) deviations away from
+    /// them, which may lie beyond [-1, 1].
+    pub fn act(&self, features: &Tensor3, noise: Option<&[f32]>) -> Vec<f32> {
         let head = self.policy.forward(features.clone(), Learning::Frozen);
         let rows = values(&head).chunks_exact(2 * self.actions);
-        rows.flat_map(|head| (0..self.actions).map(|i| self.distribution(head, i).mean)).collect()
-    }
-
-    /// Actions drawn from the policy, `[rows, actions]`; they may lie beyond [-1, 1].
-    pub fn sample(&self, features: &Tensor3, rng: &mut Rng) -> Vec<f32> {
-        let head = self.policy.forward(features.clone(), Learning::Frozen);
-        let mut drawn = Vec::with_capacity(values(&head).len() / 2);
-        for head in values(&head).chunks_exact(2 * self.actions) {
-            drawn.extend((0..self.actions).map(|i| {
-                let BoundedNormal { mean, std, .. } = self.distribution(head, i);
-                mean + std * rng::normal(rng) as f32
-            }));
+        let drawn = rows.flat_map(|head| (0..self.actions).map(|i| self.distribution(head, i)));
+        match noise {
+            None => drawn.map(|normal| normal.mean).collect(),
+            Some(noise) => drawn.zip(noise).map(|(normal, noise)| normal.mean + normal.std * noise).collect(),
         }
-        drawn
     }
 
     /// What the critic says of features.
@@ -146,10 +138,11 @@ impl ActorCritic {
         let mut latent = start.clone();
         let mut features = vec![latent.features()];
         let mut actions = Vec::with_capacity(self.config.horizon);
+        let rows = start.memory.shape().1;
         for t in 0..self.config.horizon {
-            let drawn = self.sample(&features[t], rng);
+            let noise: Vec<f32> = (0..rows * self.actions).map(|_| rng::normal(rng) as f32).collect();
+            let drawn = self.act(&features[t], Some(&noise));
             let seen: Vec<f32> = drawn.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
-            let rows = drawn.len() / self.actions;
             latent = world.imagine(&latent, &tensor(world.device(), seen, (1, rows, self.actions)), rng);
             features.push(latent.features());
             actions.push(drawn);

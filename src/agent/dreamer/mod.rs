@@ -2,7 +2,8 @@
 //!
 //! Only wiring: the world is in [`crate::model`], actor and critic are in [`ActorCritic`], planners in [`crate::plan`].
 //! Losses, networks and constants are the reference implementation's. Deviations: stretches of experience start with a
-//! blank memory, new experience is not given precedence in the replay, and when it is judged the policy acts by its mean.
+//! blank memory, new experience is not given precedence in the replay, places are seen as the way there
+//! (`model/view.rs`), and when it is judged the policy acts by its mean.
 
 mod actor_critic;
 mod planner;
@@ -64,6 +65,9 @@ pub struct DreamerConfig {
     pub warm_up: usize,
     /// Exponent of the noise of which random actions are made: 0 is white.
     pub warm_up_colour: f64,
+    /// Exponent of the noise that moves actions about the policy's mean while it explores: 0 is white, as in the reference.
+    /// Slower noise takes a hand somewhere (Eberhard et al. 2023).
+    pub exploration_colour: f64,
     /// Moments remembered.
     pub replay: usize,
 }
@@ -84,6 +88,7 @@ impl Default for DreamerConfig {
             train_ratio: 1024.0,
             warm_up: 1024,
             warm_up_colour: 0.0,
+            exploration_colour: 0.0,
             replay: 1_000_000,
         }
     }
@@ -134,6 +139,8 @@ pub struct Dreamer {
     /// Updates that are owed for what was lived through.
     owed: f32,
     random: RandomActions,
+    /// Moves its actions while it explores.
+    noise: RandomActions,
     /// Acts where it learns.
     mind: Mind,
     /// Act where it is judged, one for each seat.
@@ -177,6 +184,7 @@ impl Dreamer {
             observed: 0,
             owed: 0.0,
             random: RandomActions::new(config.warm_up_colour, spec.horizon, spec.action_size),
+            noise: RandomActions::new(config.exploration_colour, spec.horizon, spec.action_size),
             seats: Vec::new(),
             rng,
             config,
@@ -285,8 +293,8 @@ impl Mind {
         self.belief = world.observe(&self.belief, &before, obs, &mut self.rng);
     }
 
-    /// Looks, and acts.
-    fn act(&mut self, networks: &Networks, obs: &[f32], mode: Mode) -> Vec<f32> {
+    /// Looks, and acts; by the policy's mean, or so many of its deviations away from it.
+    fn act(&mut self, networks: &Networks, obs: &[f32], noise: Option<&[f32]>) -> Vec<f32> {
         let Networks { world, behaviour, .. } = networks;
         self.look(world, obs);
         let action = match &mut self.control {
@@ -295,8 +303,7 @@ impl Mind {
                 let mut objective = Imagined { world, critic: behaviour, belief: &self.belief, rng };
                 control.act(&mut objective, &mut |_| {}, &mut self.rng)
             }
-            None if mode == Mode::Explore => behaviour.sample(&self.belief.features(), &mut self.rng),
-            None => behaviour.best(&self.belief.features()),
+            None => behaviour.act(&self.belief.features(), noise),
         };
         self.action = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
         self.action.clone()
@@ -308,7 +315,8 @@ impl Agent for Dreamer {
         if self.observed < self.config.warm_up && mode == Mode::Explore {
             return self.random.next(&mut self.rng);
         }
-        self.mind.act(&self.networks, obs, mode)
+        let noise = (mode == Mode::Explore).then(|| self.noise.deviates(&mut self.rng));
+        self.mind.act(&self.networks, obs, noise.as_deref())
     }
 
     fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
@@ -326,7 +334,7 @@ impl Agent for Dreamer {
         let mut minds: Vec<Option<&mut Mind>> = minds.iter_mut().map(Some).collect();
         let busy: Vec<(&Seat, &mut Mind)> =
             seats.iter().map(|seat| (seat, minds[seat.number].take().expect("seats have different numbers"))).collect();
-        busy.into_par_iter().map(|(seat, mind)| mind.act(networks, seat.obs, Mode::Evaluate)).collect()
+        busy.into_par_iter().map(|(seat, mind)| mind.act(networks, seat.obs, None)).collect()
     }
 
     fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
@@ -350,6 +358,7 @@ impl Agent for Dreamer {
         if transition.terminated || transition.truncated {
             self.mind.forget(&self.networks.world);
             self.random.reset();
+            self.noise.reset();
         }
     }
 
@@ -424,6 +433,7 @@ impl Agent for Dreamer {
         self.rng = rng::from_state(&own);
         self.mind = Mind::new(&self.networks.world, &self.config, self.actions, rng::from_state(&mind));
         self.random.reset();
+        self.noise.reset();
         Ok(())
     }
 }
