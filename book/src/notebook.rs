@@ -141,10 +141,17 @@ pub fn failure(executed: &Value) -> Option<String> {
     for (i, cell) in executed["cells"].as_array().into_iter().flatten().enumerate() {
         for output in cell["outputs"].as_array().into_iter().flatten() {
             let text = joined(&output["text"]);
-            let wrong = output["output_type"] == "error"
+            // A kernel that cannot draw a chart writes it down instead: where a cell moves a variable of the notebook, it may.
+            let undrawn = joined(&output["data"]["text/plain"]).starts_with("Chart {");
+            let wrong = undrawn
+                || output["output_type"] == "error"
                 || output["name"] == "stderr" && (text.contains("panicked at") || text.contains("terminated with"));
             if wrong {
-                let said = if text.is_empty() { joined(&output["traceback"]) } else { text };
+                let said = match text.is_empty() {
+                    _ if undrawn => "the chart in words; give it clones of what it takes".into(),
+                    true => joined(&output["traceback"]),
+                    false => text,
+                };
                 return Some(format!("cell {i}:\n{}\nanswered\n{said}", joined(&cell["source"])));
             }
         }
