@@ -88,7 +88,8 @@ fn stale_and_failed_notebooks_are_found() {
         json!([{ "output_type": "stream", "name": "stderr", "text": ["thread panicked at src/lib.rs:2:1:\n"] }]);
     executed["cells"][2]["outputs"] = panic;
     assert!(notebook::failure(&executed).expect("a panic").contains("assert!(1 + 1 == 2);"));
-    executed["cells"][2]["outputs"] = json!([{ "output_type": "execute_result", "data": { "text/plain": "Chart { x" } }]);
+    executed["cells"][2]["outputs"] =
+        json!([{ "output_type": "execute_result", "data": { "text/plain": "Chart { x" } }]);
     assert!(notebook::failure(&executed).expect("not drawn").contains("the chart in words"));
     std::fs::remove_dir_all(&folder).expect("removed");
 }
