@@ -7,8 +7,8 @@ use crate::env::{Role, Spec};
 use crate::error::{Error, Result};
 use crate::nn::kernels::tanh;
 
-/// What counts as near: a feature's scale divided by this.
-const NEAR: f32 = 4.0;
+/// What counts as near: a difference's scale divided by this.
+pub(super) const NEAR: f32 = 4.0;
 
 /// Which numbers of an observation are which.
 #[derive(Clone, Debug, PartialEq)]

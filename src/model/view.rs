@@ -2,13 +2,11 @@
 
 use dfdx::tensor::Cpu;
 
+use super::layout::NEAR;
 use crate::env::{Role, Spec};
 use crate::nn::kernels::tanh;
 use crate::nn::two_hot::{symexp, symlog};
 use crate::nn::{Tensor3, tensor, values};
-
-/// What counts as near: a difference's scale divided by this.
-const NEAR: f32 = 4.0;
 
 /// Shifts and scales observations by the world's own [`crate::env::Feature`]s, and tames large numbers ([`symlog`]); and
 /// back.
