@@ -47,6 +47,9 @@ pub struct Feature {
     pub scale: f32,
     /// Its part in the course of events: models predict only what has a course of its own.
     pub role: Role,
+    /// The cube to whose axes it belongs, if it does. Of each cube six features say how it lies: the directions of its
+    /// x-axis and of its z-axis, in this order. Nobody can tell a cube's sides apart, and models need not.
+    pub cube: Option<String>,
 }
 
 /// What part a number has in the course of events.
@@ -69,7 +72,7 @@ pub enum Role {
 impl Feature {
     /// A feature around zero of size one.
     pub fn new(name: impl Into<String>) -> Self {
-        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::State }
+        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::State, cube: None }
     }
 
     /// The same feature, which stays as it is through an episode.
@@ -80,6 +83,11 @@ impl Feature {
     /// The same feature, which is the difference of two others.
     pub fn difference(self, minuend: impl Into<String>, subtrahend: impl Into<String>) -> Self {
         Self { role: Role::Difference { minuend: minuend.into(), subtrahend: subtrahend.into() }, ..self }
+    }
+
+    /// The same feature, if it says how a cube lies.
+    pub fn axis_of_cube(self, cube: &str) -> Self {
+        Self { cube: Some(cube.into()), ..self }
     }
 
     /// The same feature around another centre and of another size.

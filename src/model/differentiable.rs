@@ -1,12 +1,12 @@
 //! Gradients of imagined returns with respect to actions, by dfdx's tape through the networks.
 //!
 //! Each member follows its own mean, without chance. A known reward is differentiated by central differences: it
-//! is a cheap function of a few numbers.
+//! is a cheap function of a few numbers. Cubes are seen upright at the start, and keep those names of their axes to the end.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
-use super::{Dynamics, Reward};
+use super::{Dynamics, Layout, Reward};
 use crate::env::KnownReward;
 use crate::nn::{Activation, Learning, Mlp, Tensor3, device, ops, tensor, values};
 
@@ -25,6 +25,7 @@ pub struct Differentiable {
     networks: Mlp,
     gated: bool,
     exit: Fixed,
+    layout: Layout,
     members: usize,
     observation: usize,
     actions: usize,
@@ -95,6 +96,7 @@ impl Differentiable {
             networks: dynamics.networks(&cpu),
             gated: dynamics.gated(),
             exit: Fixed::new(&cpu, members, &exit, &bias),
+            layout: layout.clone(),
             members,
             observation: width,
             actions,
@@ -131,6 +133,8 @@ impl Differentiable {
                 tensor(&self.cpu, of_step.repeat(members), (members, candidates, width))
             })
             .collect();
+        let mut obs = obs.to_vec();
+        self.layout.upright(&mut obs, None);
         let start = tensor(&self.cpu, obs.repeat(members * candidates), (members, candidates, self.observation));
         let (mut state, mut tape) = start.leaky_traced().split_tape();
         let mut rewards: Vec<Tensor3> = Vec::with_capacity(horizon);

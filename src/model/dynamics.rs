@@ -46,6 +46,8 @@ pub(super) struct Scratch {
     x: Vec<f32>,
     /// What comes out.
     y: Vec<f32>,
+    /// A state with its cubes upright.
+    upright: Vec<f32>,
 }
 
 impl Dynamics {
@@ -138,18 +140,22 @@ impl Dynamics {
     pub(super) fn ask<'a>(
         &self,
         member: usize,
-        rows: impl Iterator<Item = usize>,
+        rows: impl Iterator<Item = usize> + Clone,
         states: &[f32],
         actions: &[f32],
         scratch: &'a mut Scratch,
     ) -> &'a mut [f32] {
-        let Scratch { x, y } = scratch;
+        let Scratch { x, y, upright } = scratch;
+        let state_of = |row: usize| &states[row * self.layout.width..][..self.layout.width];
         x.clear();
-        for row in rows {
-            let (state, action) = (
-                &states[row * self.layout.width..][..self.layout.width],
-                &actions[row * self.actions..][..self.actions],
-            );
+        for row in rows.clone() {
+            let (mut state, action) = (state_of(row), &actions[row * self.actions..][..self.actions]);
+            if !self.layout.cubes.is_empty() {
+                upright.clear();
+                upright.extend_from_slice(state);
+                self.layout.upright(upright, None);
+                state = upright;
+            }
             let read = self.layout.read(state).chain(action.iter().copied());
             let features = self.inputs.mean.iter().zip(&self.inputs.scale);
             x.extend(read.zip(features).map(|(x, (mean, scale))| (x - mean) / scale));
@@ -170,6 +176,12 @@ impl Dynamics {
         let Normaliser { mean, scale } = &self.targets;
         let [max, min] = &self.bounds;
         denormalise(x, mean, scale, max, min, &self.temperature);
+        if !self.layout.cubes.is_empty() {
+            for (row, head) in rows.zip(x.chunks_exact_mut(2 * self.outputs())) {
+                let (changes, deviations) = head.split_at_mut(self.outputs());
+                self.layout.name_back(state_of(row), changes, deviations);
+            }
+        }
         x
     }
 }

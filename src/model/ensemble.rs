@@ -264,8 +264,10 @@ impl Ensemble {
         let (mut inputs, mut targets) = (Vec::new(), Vec::new());
         for i in 0..data.len() {
             let row = data.row(i);
-            inputs.extend(self.layout.read(row.obs).chain(row.action.iter().copied()));
-            targets.extend(self.layout.predicted.iter().map(|i| row.next_obs[*i] - row.obs[*i]));
+            let (mut obs, mut next) = (row.obs.to_vec(), row.next_obs.to_vec());
+            self.layout.upright(&mut obs, Some(&mut next));
+            inputs.extend(self.layout.read(&obs).chain(row.action.iter().copied()));
+            targets.extend(self.layout.predicted.iter().map(|i| next[*i] - obs[*i]));
             if self.config.learn_reward {
                 targets.push(row.reward);
             }

@@ -407,7 +407,8 @@ mod tests {
         let members = [layer(drift), layer(-drift)];
         let layers = members.iter().map(|(weight, bias)| std::iter::once((&weight[..], &bias[..])));
         let identity = Normaliser::identity;
-        let layout = Layout { width: 1, inputs: vec![0], near: vec![], predicted: vec![0], differences: vec![] };
+        let layout =
+            Layout { width: 1, inputs: vec![0], near: vec![], predicted: vec![0], differences: vec![], cubes: vec![] };
         Dynamics::new(layers, layout, 1, identity(2), identity(1), [&[5.0], &[-40.0]], vec![1.0])
     }
 

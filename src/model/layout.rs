@@ -3,6 +3,7 @@
 //! A goal does not move, and the way from the hand to a cube is the difference of two positions: a network that had to
 //! learn that would find it true only about, and would take a goal for the reason of what happened near it.
 
+use super::cube::Cube;
 use crate::env::{Role, Spec};
 use crate::error::{Error, Result};
 use crate::nn::kernels::tanh;
@@ -24,6 +25,8 @@ pub struct Layout {
     pub predicted: Vec<usize>,
     /// Those that are the difference of two others: `[itself, minuend, subtrahend]`.
     pub differences: Vec<[usize; 3]>,
+    /// Cubes, which networks see and foretell as if each lay upright and looked ahead.
+    pub cubes: Vec<Cube>,
 }
 
 impl Layout {
@@ -60,7 +63,8 @@ impl Layout {
         if predicted.is_empty() {
             return Err(Error::BadSetting(format!("{}: nothing in an observation has a course of its own", spec.name)));
         }
-        Ok(Self { width: features.len(), inputs, near, predicted, differences })
+        let cubes = Cube::find(spec, &predicted);
+        Ok(Self { width: features.len(), inputs, near, predicted, differences, cubes })
     }
 
     /// How many numbers networks read of an observation.
@@ -72,6 +76,23 @@ impl Layout {
     pub fn read<'a>(&'a self, obs: &'a [f32]) -> impl Iterator<Item = f32> + 'a {
         let near = self.near.iter().map(|(i, factor)| tanh(factor * obs[*i]));
         self.inputs.iter().map(|i| obs[*i]).chain(near)
+    }
+
+    /// Names the axes of each cube so that it lies upright and looks ahead; and those in `after` (what came next) alike.
+    pub fn upright(&self, obs: &mut [f32], mut after: Option<&mut [f32]>) {
+        for cube in &self.cubes {
+            let names = cube.upright(obs);
+            cube.rename(names, obs);
+            if let Some(after) = &mut after {
+                cube.rename(names, after);
+            }
+        }
+    }
+
+    /// Takes what is foretold of an upright `obs` back to the names that it has: changes of all that is predicted, and
+    /// their standard deviations.
+    pub fn name_back(&self, obs: &[f32], changes: &mut [f32], deviations: &mut [f32]) {
+        self.cubes.iter().for_each(|cube| cube.name_back(cube.upright(obs), obs, changes, deviations));
     }
 
     /// Puts right, in an observation whose predicted numbers are new, what follows from them.

@@ -5,6 +5,7 @@
 
 mod autoencoder;
 pub mod calibration;
+mod cube;
 mod differentiable;
 mod dynamics;
 mod ensemble;
@@ -18,6 +19,7 @@ mod view;
 mod world_model;
 
 pub use autoencoder::{Autoencoder, AutoencoderConfig};
+pub use cube::Cube;
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit};

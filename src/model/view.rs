@@ -2,6 +2,7 @@
 
 use dfdx::tensor::Cpu;
 
+use super::cube::Cube;
 use super::layout::NEAR;
 use crate::env::{Role, Spec};
 use crate::nn::kernels::tanh;
@@ -27,6 +28,8 @@ pub struct View {
     near: Vec<usize>,
     /// What is found again, in this order: `[itself, subtrahend, difference]`.
     found: Vec<[usize; 3]>,
+    /// Cubes, which are seen, and told, as if each lay upright and looked ahead.
+    cubes: Vec<Cube>,
 }
 
 impl View {
@@ -45,10 +48,13 @@ impl View {
                 found.push([minuend, subtrahend, i]);
             }
         }
+        let lively: Vec<usize> = (0..features.len()).filter(|i| features[*i].role == Role::State).collect();
         Self {
+            cubes: Cube::find(spec, &lively),
             centre: features.iter().map(|feature| feature.centre).collect(),
             scale: features.iter().map(|feature| feature.scale).collect(),
-            lively: (0..features.len()).filter(|i| features[*i].role == Role::State).collect(),
+            // How a cube lies is told under other names.
+            lively: lively.into_iter().filter(|i| features[*i].cube.is_none()).collect(),
             seen: (0..features.len()).filter(|i| found.iter().all(|[itself, ..]| itself != i)).collect(),
             near,
             found,
@@ -64,7 +70,11 @@ impl View {
     pub fn seen(&self, cpu: &Cpu, obs: &[f32]) -> Tensor3 {
         let size = self.centre.len();
         let mut seen = Vec::with_capacity(obs.len());
-        for row in obs.chunks_exact(size) {
+        let mut row = Vec::with_capacity(size);
+        for obs in obs.chunks_exact(size) {
+            row.clear();
+            row.extend_from_slice(obs);
+            self.cubes.iter().for_each(|cube| cube.rename(cube.upright(obs), &mut row));
             let scaled = |i: &usize| (row[*i] - self.centre[*i]) / self.scale[*i];
             seen.extend(self.seen.iter().map(|i| symlog(scaled(i))));
             seen.extend(self.near.iter().map(|i| tanh(NEAR * scaled(i))));
@@ -105,8 +115,9 @@ mod tests {
     fn what_is_seen_can_be_told() {
         for task in Task::ALL {
             let mut world = task.make();
-            let obs = world.reset(3);
+            let mut obs = world.reset(3);
             let view = View::new(world.spec());
+            view.cubes.iter().for_each(|cube| cube.rename(cube.upright(&obs), &mut obs));
             let seen = view.seen(&device(), &[obs.clone(), obs.clone()].concat());
             assert_eq!(*seen.shape(), (1, 2, view.width()));
             let told = view.told(&seen);

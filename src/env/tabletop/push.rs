@@ -5,8 +5,8 @@
 use nalgebra::Vector3;
 
 use super::task::{
-    HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, named, object_features, object_state_of,
-    object_values, on_table, towards, vector, way, xyz,
+    HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, cube_features, named, object_state_of, object_values,
+    on_table, towards, vector, way, xyz,
 };
 use crate::env::Feature;
 use crate::env::arm::Primitive;
@@ -62,8 +62,7 @@ impl TableTask for Push {
 
     fn features(&self) -> Vec<Feature> {
         let table = TABLE_TOP as f32;
-        object_features("cube")
-            .into_iter()
+        cube_features("cube")
             .chain(way("hand", "cube"))
             .chain(xyz("goal", [0.0, 0.0, table], 0.1).map(Feature::constant))
             .chain(way("cube", "goal"))

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::lift::{CUBE, LIFTED, descend_and_close, grasped};
 use super::task::{
-    Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, named, object_features,
+    Judgement, Setup, TableTask, View, closeness, cube_features, gripper_features, gripper_values, named,
     object_state_of, object_values, on_table, towards, vector, way,
 };
 use crate::env::Feature;
@@ -59,8 +59,8 @@ impl TableTask for Stack {
     fn features(&self) -> Vec<Feature> {
         gripper_features()
             .into_iter()
-            .chain(object_features("cube"))
-            .chain(object_features("base"))
+            .chain(cube_features("cube"))
+            .chain(cube_features("base"))
             .chain(way("hand", "cube"))
             .chain(way("cube", "base"))
             .chain([Feature::new("cube touches base").around(0.5, 0.5)])

@@ -110,6 +110,13 @@ pub(super) fn object_features(name: &str) -> Vec<Feature> {
         .collect()
 }
 
+/// [`object_features`] of a cube.
+pub(super) fn cube_features(name: &str) -> impl Iterator<Item = Feature> {
+    object_features(name)
+        .into_iter()
+        .map(move |feature| if feature.name.contains("-axis ") { feature.axis_of_cube(name) } else { feature })
+}
+
 /// The values of [`object_features`].
 pub(super) fn object_values(view: &View, object: usize) -> Vec<f64> {
     let state = view.physics.object_state(view.setup.objects[object]);
