@@ -5,7 +5,10 @@ use dfdx::tensor::Cpu;
 use super::uncertainty::split;
 use super::{Layout, Normaliser};
 use crate::nn::kernels::{self, Matrix, vectorised_fn};
-use crate::nn::{Activation, Mlp, bounded, ops};
+use crate::nn::{Activation, Mlp, bounded_variance, ops};
+
+/// Numbers in the widest vector of any processor: as many rows go through a network at once as whole vectors hold.
+const VECTOR: usize = 16;
 
 /// Elites of an ensemble, frozen. All predictions are in physical units unless said otherwise.
 #[derive(Clone, Debug)]
@@ -15,12 +18,12 @@ pub struct Dynamics {
     actions: usize,
     pub(super) inputs: Normaliser,
     pub(super) targets: Normaliser,
-    /// Upper and lower bounds of log-variances.
-    bounds: [Vec<f32>; 2],
+    /// Least precision and least variance of each output, normalised: see [`bounded_variance`].
+    least: [Vec<f32>; 2],
     temperature: Vec<f32>,
 }
 
-/// Weight `[input, output]` and bias `[output]`.
+/// Weight `[output, input]` and bias `[output]`.
 #[derive(Clone, Debug)]
 struct Layer {
     weight: Vec<f32>,
@@ -42,9 +45,9 @@ pub struct Prediction {
 /// Buffers of a forward pass, to be used again.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    /// What goes into a layer.
+    /// What goes into a layer, `[input, rows]`.
     x: Vec<f32>,
-    /// What comes out.
+    /// What comes out, `[output, rows]`; of the last layer `[rows, output]`.
     y: Vec<f32>,
     /// A state with its cubes upright.
     upright: Vec<f32>,
@@ -61,9 +64,11 @@ impl Dynamics {
         [max, min]: [&[f32]; 2],
         temperature: Vec<f32>,
     ) -> Self {
-        let layer = |(weight, bias): (&[f32], &[f32])| Layer { weight: weight.to_vec(), bias: bias.to_vec() };
+        let layer =
+            |(weight, bias): (&[f32], &[f32])| Layer { weight: transposed(weight, bias.len()), bias: bias.to_vec() };
         let members = members.map(|layers| layers.map(layer).collect()).collect();
-        Self { members, layout, actions, inputs, targets, bounds: [max.to_vec(), min.to_vec()], temperature }
+        let least = [max.iter().map(|max| (-max).exp()).collect(), min.iter().map(|min| min.exp()).collect()];
+        Self { members, layout, actions, inputs, targets, least, temperature }
     }
 
     /// Networks.
@@ -117,11 +122,8 @@ impl Dynamics {
 
     /// The same networks on dfdx, to be differentiated.
     pub(super) fn networks(&self, cpu: &Cpu) -> Mlp {
-        let members: Vec<Vec<(&[f32], &[f32])>> = self
-            .members
-            .iter()
-            .map(|layers| layers.iter().map(|layer| (&layer.weight[..], &layer.bias[..])).collect())
-            .collect();
+        let layer = |Layer { weight, bias }: &Layer| (transposed(weight, weight.len() / bias.len()), bias.clone());
+        let members: Vec<Vec<_>> = self.members.iter().map(|layers| layers.iter().map(layer).collect()).collect();
         Mlp::from_layers(cpu, &members, Activation::Silu)
     }
 
@@ -147,8 +149,11 @@ impl Dynamics {
     ) -> &'a mut [f32] {
         let Scratch { x, y, upright } = scratch;
         let state_of = |row: usize| &states[row * self.layout.width..][..self.layout.width];
-        x.clear();
-        for row in rows.clone() {
+        let count = rows.clone().count();
+        // Whole vectors of rows; what stands in the rows beyond the last is nobody's.
+        let padded = count.next_multiple_of(VECTOR);
+        x.resize(self.inputs.mean.len() * padded, 0.0);
+        for (place, row) in rows.clone().enumerate() {
             let (mut state, action) = (state_of(row), &actions[row * self.actions..][..self.actions]);
             if !self.layout.cubes.is_empty() {
                 upright.clear();
@@ -158,32 +163,41 @@ impl Dynamics {
             }
             let read = self.layout.read(state).chain(action.iter().copied());
             let features = self.inputs.mean.iter().zip(&self.inputs.scale);
-            x.extend(read.zip(features).map(|(x, (mean, scale))| (x - mean) / scale));
+            for ((x, value), (mean, scale)) in x[place..].iter_mut().step_by(padded).zip(read).zip(features) {
+                *x = (value - mean) / scale;
+            }
         }
-        let layers = &self.members[member];
-        for (i, Layer { weight, bias }) in layers.iter().enumerate() {
-            let outputs = bias.len();
-            let inputs = weight.len() / outputs;
-            y.resize(x.len() / inputs * outputs, 0.0);
-            kernels::matmul(y, Matrix::new(x, inputs), Matrix::new(weight, outputs), false);
-            let activation = if i + 1 < layers.len() { Activation::Silu } else { Activation::Identity };
-            kernels::add_and_activate(y, bias, activation);
+        let (head, hidden) = self.members[member].split_last().expect("a network has layers");
+        for Layer { weight, bias } in hidden {
+            y.resize(bias.len() * padded, 0.0);
+            kernels::matmul(y, Matrix::new(weight, weight.len() / bias.len()), Matrix::new(x, padded), false);
+            kernels::add_to_rows_and_activate(y, bias, Activation::Silu);
             std::mem::swap(x, y);
         }
+        y.resize(padded * head.bias.len(), 0.0);
+        let weight = Matrix::new(&head.weight, head.weight.len() / head.bias.len());
+        kernels::matmul(y, Matrix::new(x, padded).t(), weight.t(), false);
+        y.truncate(count * head.bias.len());
+        kernels::add_and_activate(y, &head.bias, Activation::Identity);
         if self.gated() {
-            ops::gate_rows(x, self.outputs());
+            ops::gate_rows(y, self.outputs());
         }
         let Normaliser { mean, scale } = &self.targets;
-        let [max, min] = &self.bounds;
-        denormalise(x, mean, scale, max, min, &self.temperature);
+        let [precision, variance] = &self.least;
+        denormalise(y, mean, scale, precision, variance, &self.temperature);
         if !self.layout.cubes.is_empty() {
-            for (row, head) in rows.zip(x.chunks_exact_mut(2 * self.outputs())) {
+            for (row, head) in rows.zip(y.chunks_exact_mut(2 * self.outputs())) {
                 let (changes, deviations) = head.split_at_mut(self.outputs());
                 self.layout.name_back(state_of(row), changes, deviations);
             }
         }
-        x
+        y
     }
+}
+
+/// A row-major matrix of so many columns, transposed.
+fn transposed(matrix: &[f32], columns: usize) -> Vec<f32> {
+    (0..columns).flat_map(|column| matrix.iter().skip(column).step_by(columns)).copied().collect()
 }
 
 vectorised_fn! {
@@ -192,18 +206,19 @@ vectorised_fn! {
         head: &'a mut [f32],
         mean: &'a [f32],
         scale: &'a [f32],
-        max: &'a [f32],
-        min: &'a [f32],
+        least_precision: &'a [f32],
+        least_variance: &'a [f32],
         temperature: &'a [f32],
     ) {
         let n = mean.len();
-        let (scale, max, min, temperature) = (&scale[..n], &max[..n], &min[..n], &temperature[..n]);
+        let (precision, variance) = (&least_precision[..n], &least_variance[..n]);
+        let (scale, temperature) = (&scale[..n], &temperature[..n]);
         for row in head.chunks_exact_mut(2 * n) {
             let (means, raw) = row.split_at_mut(n);
             let raw = &mut raw[..n];
             for i in 0..n {
                 means[i] = means[i].mul_add(scale[i], mean[i]);
-                raw[i] = kernels::exp(0.5 * bounded(raw[i], max[i], min[i])) * temperature[i] * scale[i];
+                raw[i] = bounded_variance(raw[i], precision[i], variance[i]).sqrt() * temperature[i] * scale[i];
             }
         }
     }

@@ -13,6 +13,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use rand::RngExt;
 use rand::seq::SliceRandom;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{Dynamics, Layout, Normaliser};
@@ -27,6 +28,8 @@ use crate::rng::Rng;
 
 /// A feature that moves less than this share of its typical size counts as still.
 const STILL: f32 = 1e-3;
+/// Rows that one thread gathers before another may: copies are quick.
+const ROWS_AT_A_TIME: usize = 256;
 /// Rows held out at most: enough to judge by.
 const MAX_HELD_OUT: usize = 2000;
 /// A network has become better when its error fell by this share.
@@ -297,7 +300,7 @@ impl Ensemble {
         let shape = |width| (self.config.members, batch, width);
         let x = tensor(&self.cpu, gather(&data.inputs, &rows, data.rows), shape(data.inputs.len() / data.rows));
         let y = tensor(&self.cpu, gather(&data.targets, &rows, data.rows), shape(data.targets.len() / data.rows));
-        let head = self.head(x.leaky_traced(), Learning::Trained);
+        let head = self.head(x.leaky_traced(), Learning::FromData);
         let learning = if self.config.learn_bounds { Learning::Trained } else { Learning::Frozen };
         let loss = bounded_nll(head, &y, &self.learner.bounds, self.config.beta, learning);
         let answer = values(&loss)[0];
@@ -467,8 +470,11 @@ impl Schedule {
 /// The given rows of a table of `count` rows.
 fn gather(table: &[f32], rows: &[usize], count: usize) -> Vec<f32> {
     let width = table.len() / count;
-    let mut gathered = Vec::with_capacity(rows.len() * width);
-    rows.iter().for_each(|row| gathered.extend_from_slice(&table[row * width..][..width]));
+    let mut gathered = vec![0.0; rows.len() * width];
+    let copies = gathered.par_chunks_mut(ROWS_AT_A_TIME * width).zip(rows.par_chunks(ROWS_AT_A_TIME));
+    copies.for_each(|(to, rows)| {
+        to.chunks_exact_mut(width).zip(rows).for_each(|(to, row)| to.copy_from_slice(&table[row * width..][..width]));
+    });
     gathered
 }
 

@@ -246,6 +246,20 @@ vectorised_fn! {
     }
 }
 
+vectorised_fn! {
+    /// `y = activation(y + b)` for rows of y, with one number of b for each.
+    pub fn add_to_rows_and_activate(y: &'a mut [f32], b: &'a [f32], activation: Activation) {
+        let width = y.len() / b.len();
+        for (row, b) in y.chunks_exact_mut(width).zip(b) {
+            match activation {
+                Activation::Identity => row.iter_mut().for_each(|y| *y += b),
+                Activation::Relu => row.iter_mut().for_each(|y| *y = (*y + b).max(0.0)),
+                Activation::Silu => row.iter_mut().for_each(|y| *y = silu(*y + b)),
+            }
+        }
+    }
+}
+
 #[inline(always)]
 fn for_rows(y: &mut [f32], b: &[f32], f: impl Fn(f32) -> f32) {
     for row in y.chunks_exact_mut(b.len()) {

@@ -129,10 +129,10 @@ impl Mlp {
     ///
     /// # Panics
     /// If the members' layers are not of the same sizes.
-    pub fn from_layers(cpu: &Cpu, members: &[Vec<(&[f32], &[f32])>], activation: Activation) -> Self {
+    pub fn from_layers(cpu: &Cpu, members: &[Vec<(Vec<f32>, Vec<f32>)>], activation: Activation) -> Self {
         let layer = |i: usize| {
-            let weights: Vec<f32> = members.iter().flat_map(|layers| layers[i].0).copied().collect();
-            let biases: Vec<f32> = members.iter().flat_map(|layers| layers[i].1).copied().collect();
+            let weights: Vec<f32> = members.iter().flat_map(|layers| &layers[i].0).copied().collect();
+            let biases: Vec<f32> = members.iter().flat_map(|layers| &layers[i].1).copied().collect();
             let output = biases.len() / members.len();
             let input = weights.len() / biases.len();
             let weight = super::tensor(cpu, weights, (members.len(), input, output));

@@ -2,6 +2,7 @@
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
+use rayon::prelude::*;
 
 use super::Parameters;
 use super::kernels::{self, vectorised_fn};
@@ -44,6 +45,13 @@ pub fn bounded(raw: f32, max: f32, min: f32) -> f32 {
     min + kernels::softplus(below - min)
 }
 
+/// The variance that a [`bounded`] log-variance stands for, in closed form and so cheaper: a softplus is the logarithm of a
+/// sum, so the bounds add `exp(-max)` to the precision and then `exp(min)` to the variance.
+#[inline(always)]
+pub(crate) fn bounded_variance(raw: f32, least_precision: f32, least_variance: f32) -> f32 {
+    least_variance + 1.0 / (least_precision + kernels::exp(-raw))
+}
+
 /// The loss of an ensemble: over its networks the sum of
 /// `mean over batch and outputs of (mean - target)^2 exp(-v) + v`, v the bounded log-variance.
 /// If the bounds are trained, `0.01 (sum(max) - sum(min))` comes on top.
@@ -70,12 +78,20 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
 
     // The loss, and its gradients in the same pass: they share everything that is costly.
     let share = 1.0 / (batch * outputs) as f32;
-    let mut losses = vec![0.0; outputs];
     let mut d_head = vec![0.0; values(&head).len()];
-    let (mut d_max, mut d_min) = (vec![0.0; outputs], vec![0.0; outputs]);
     let (maxima, minima) = (values(&max), values(&min));
-    let parts = [values(&head), values(targets), maxima, minima];
-    nll_rows(parts, share, beta, &mut losses, &mut d_head, &mut d_max, &mut d_min);
+    let networks = values(&head).par_chunks_exact(batch * width).zip(values(targets).par_chunks_exact(batch * outputs));
+    let of_networks: Vec<[Vec<f32>; 3]> = networks
+        .zip(d_head.par_chunks_exact_mut(batch * width))
+        .map(|((head, targets), d_head)| {
+            let mut sums = [0; 3].map(|_| vec![0.0; outputs]);
+            let [losses, d_max, d_min] = &mut sums;
+            nll_rows([head, targets, maxima, minima], share, beta, losses, d_head, d_max, d_min);
+            sums
+        })
+        .collect();
+    let [losses, mut d_max, mut d_min]: [Vec<f32>; 3] =
+        std::array::from_fn(|k| (0..outputs).map(|i| of_networks.iter().map(|sums| sums[k][i]).sum()).collect());
     let mut loss = losses.iter().map(|loss| f64::from(*loss)).sum::<f64>();
     if learning == Learning::Trained {
         loss += f64::from(BOUND_PENALTY * maxima.iter().zip(minima).map(|(max, min)| max - min).sum::<f32>());
@@ -161,6 +177,8 @@ mod tests {
         let expected =
             [-9.999_954_60, -9.306_866_59, -4.997_335_74, -0.474_004_05, -0.193_092_11, 0.298_620_40, 0.499_952_69];
         near(&found, &expected);
+        let variances = raw.map(|raw| bounded_variance(raw, (-0.5_f32).exp(), (-10.0_f32).exp()));
+        near(&variances, &expected.map(f64::exp));
     }
 
     #[test]

@@ -24,6 +24,7 @@ pub use dfdx;
 pub use gaussian::{BoundedNormal, SquashedGaussian};
 pub use kernels::Activation;
 pub use layers::{Init, Mlp, MlpConfig, Norm};
+pub(crate) use likelihood::bounded_variance;
 pub use likelihood::{LogVarianceBounds, bounded, bounded_nll};
 pub use ops::{Learning, Tensor2, Tensor3, values};
 pub(crate) use parameters::parameters_of_fields;
