@@ -189,6 +189,11 @@ fn notebooks(root: &Path, names: &[String]) -> Result<()> {
         let known: Vec<&str> = chapters.iter().map(|chapter| chapter.name.as_str()).collect();
         bail!("there is no chapter `{unknown}`; there are {}", known.join(", "));
     }
+    // Two at once would write the same files.
+    let lock = fs::File::create(root.join("target/notebooks.lock")).context("target/notebooks.lock")?;
+    if lock.try_lock().is_err() {
+        bail!("another `cargo book notebooks` is at work: wait for it, or end it");
+    }
     for chapter in chapters {
         let wanted = if names.is_empty() {
             notebook::complaint(&chapter, &folder).is_some()

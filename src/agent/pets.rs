@@ -210,12 +210,12 @@ impl Pilot {
         Self { control: RecedingHorizon::new(&config.planner, spec.action_size, &config.control), rng }
     }
 
-    fn act(&mut self, view: &View, obs: &[f32], curiosity: f32, observer: &mut Observer) -> Vec<f32> {
+    fn act(&mut self, foresight: &Foresight, obs: &[f32], curiosity: f32, observer: &mut Observer) -> Vec<f32> {
         let mut objective = Imagined {
-            imagination: view.imagination(),
+            imagination: foresight.imagination(),
             obs,
-            risk: view.config.risk,
-            disagreement: curiosity - view.config.caution,
+            risk: foresight.config.risk,
+            disagreement: curiosity - foresight.config.caution,
             rng: rng::fork(&mut self.rng),
             differentiable: None,
         };
@@ -224,7 +224,7 @@ impl Pilot {
 }
 
 /// All that planning needs of an agent.
-struct View<'a> {
+struct Foresight<'a> {
     config: &'a PetsConfig,
     dynamics: &'a Dynamics,
     reward: &'a (dyn KnownReward + Send + Sync),
@@ -232,7 +232,7 @@ struct View<'a> {
     tail: Option<Box<Value<'a>>>,
 }
 
-impl<'a> View<'a> {
+impl<'a> Foresight<'a> {
     fn new(config: &'a PetsConfig, dynamics: &'a Dynamics, reward: &'a (dyn KnownReward + Send + Sync)) -> Self {
         let rest = vec![0.0; dynamics.action_size()];
         let lasting = move |state: &[f32]| config.tail * reward.reward(state, &rest, state);
@@ -279,27 +279,27 @@ impl<'a> View<'a> {
 impl Agent for Pets {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         let Some(dynamics) = &self.dynamics else { return self.random.next(&mut self.rng) };
-        let view = View::new(&self.config, dynamics, self.reward.as_ref());
+        let foresight = Foresight::new(&self.config, dynamics, self.reward.as_ref());
         let curiosity = if mode == Mode::Explore { self.config.curiosity } else { 0.0 };
-        self.pilot.act(&view, obs, curiosity, &mut |_| {})
+        self.pilot.act(&foresight, obs, curiosity, &mut |_| {})
     }
 
     fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
         self.prepare(seats);
         let Some(dynamics) = &self.dynamics else { return vec![vec![0.0; self.spec.action_size]; seats.len()] };
-        let view = View::new(&self.config, dynamics, self.reward.as_ref());
+        let foresight = Foresight::new(&self.config, dynamics, self.reward.as_ref());
         let mut pilots: Vec<Option<&mut Pilot>> = self.seats.iter_mut().map(Some).collect();
         let busy: Vec<(&Seat, &mut Pilot)> = seats
             .iter()
             .map(|seat| (seat, pilots[seat.number].take().expect("seats have different numbers")))
             .collect();
-        busy.into_par_iter().map(|(seat, pilot)| pilot.act(&view, seat.obs, 0.0, &mut |_| {})).collect()
+        busy.into_par_iter().map(|(seat, pilot)| pilot.act(&foresight, seat.obs, 0.0, &mut |_| {})).collect()
     }
 
     fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
         self.prepare(&[*seat]);
         let Some(dynamics) = &self.dynamics else { return (vec![0.0; self.spec.action_size], Vec::new()) };
-        let view = View::new(&self.config, dynamics, self.reward.as_ref());
+        let foresight = Foresight::new(&self.config, dynamics, self.reward.as_ref());
         // The plan, and of each iteration a few that were tried, from the best to the worst.
         let mut shown: Option<Sequences> = None;
         let mut observer = |iteration: &Iteration| {
@@ -311,8 +311,8 @@ impl Agent for Pets {
             // The newest, and so the best, come first.
             shown.values.splice(0..0, some.copied());
         };
-        let action = self.seats[seat.number].act(&view, seat.obs, 0.0, &mut observer);
-        (action, shown.map(|shown| view.foresee(seat.obs, &shown)).unwrap_or_default())
+        let action = self.seats[seat.number].act(&foresight, seat.obs, 0.0, &mut observer);
+        (action, shown.map(|shown| foresight.foresee(seat.obs, &shown)).unwrap_or_default())
     }
 
     fn observe(&mut self, transition: &Transition) {

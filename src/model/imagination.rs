@@ -171,7 +171,7 @@ impl Imagination<'_> {
             }
             match self.propagation {
                 Propagation::TsInf | Propagation::Ts1 | Propagation::Members => {
-                    self.sample(&states, &now, &mut next, &mut rewards, luck.at(t), &mut scratch);
+                    self.sample(t == 0, &states, &now, &mut next, &mut rewards, luck.at(t), &mut scratch);
                     self.add_spread_between_members(&next, luck.at(t), disagreement);
                 }
                 Propagation::Mean | Propagation::MomentMatching => {
@@ -203,9 +203,12 @@ impl Imagination<'_> {
         }
     }
 
-    /// Trajectory sampling: every particle asks the member that it is with.
+    /// Trajectory sampling: every particle asks the member that it is with. As long as they are all `together`, one asks
+    /// for all of them.
+    #[allow(clippy::too_many_arguments)]
     fn sample(
         &self,
+        together: bool,
         states: &[f32],
         actions: &[f32],
         next: &mut [f32],
@@ -219,9 +222,10 @@ impl Imagination<'_> {
         let particles = luck.order.len();
         let candidates = rewards.len() / particles;
         for (member, flock) in luck.order.chunks_exact(particles / self.dynamics.members()).enumerate() {
-            let rows = flock.iter().flat_map(|p| p * candidates..(p + 1) * candidates);
+            let asking = if together { &flock[..1] } else { flock };
+            let rows = asking.iter().flat_map(|p| p * candidates..(p + 1) * candidates);
             let head = self.dynamics.ask(member, rows, states, actions, scratch);
-            for (&p, head) in flock.iter().zip(head.chunks_exact(candidates * 2 * outputs)) {
+            for (&p, head) in flock.iter().zip(head.chunks_exact(candidates * 2 * outputs).cycle()) {
                 let noise = &luck.noise[p * outputs..][..outputs];
                 let rows = p * candidates * width..(p + 1) * candidates * width;
                 let rows = states[rows.clone()].chunks_exact(width).zip(next[rows].chunks_exact_mut(width));
