@@ -74,9 +74,12 @@ fn a_layer_does_not_depend_on_the_number_of_threads() {
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let (mut y, mut dx) = (vec![0.0; 301 * 129], vec![0.0; 301 * 77]);
+            let (mut y, mut before, mut dx) = (vec![0.0; 301 * 129], vec![0.0; 301 * 129], vec![0.0; 301 * 77]);
             let (mut dw, mut db) = (vec![0.0; 77 * 129], vec![0.0; 129]);
-            kernels::dense(&mut y, &x, &w, &b, shape, Activation::Relu);
+            kernels::dense(&mut y, Some(&mut before), &x, &w, &b, shape, Activation::Relu);
+            assert!(y.iter().zip(&before).all(|(y, before)| *y == before.max(0.0)));
+            kernels::dense(&mut before, None, &x, &w, &b, shape, Activation::Relu);
+            assert_eq!(y, before);
             kernels::dense_input_gradient(&mut dx, &y, &w, shape);
             kernels::dense_parameter_gradients(&mut dw, &mut db, &x, &y, shape);
             [y, dx, dw, db].concat().iter().map(|v: &f32| v.to_bits()).collect::<Vec<u32>>()

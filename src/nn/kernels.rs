@@ -206,6 +206,12 @@ impl DenseShape {
         rows.div_ceil(tasks).max(enough).min(rows).max(1)
     }
 
+    /// The rows of all networks, `[members, batch, output]`, as they are handed out.
+    fn tasks<'a>(&self, y: &'a mut [f32], rows: usize) -> Vec<&'a mut [f32]> {
+        let members = y.chunks_mut(self.batch * self.output);
+        members.flat_map(|y| y.chunks_mut(rows * self.output)).collect()
+    }
+
     fn input_of<'a>(&self, x: &'a [f32], member: usize) -> &'a [f32] {
         let size = self.batch * self.input;
         if self.shared_input { x } else { &x[member * size..][..size] }
@@ -218,21 +224,37 @@ impl DenseShape {
 }
 
 /// `y = activation(x w + b)` for every network: x `[members or 1, batch, input]`,
-/// w `[members, input, output]`, b `[members, output]`, y `[members, batch, output]`.
-pub fn dense(y: &mut [f32], x: &[f32], w: &[f32], b: &[f32], shape: DenseShape, activation: Activation) {
+/// w `[members, input, output]`, b `[members, output]`, y `[members, batch, output]`. What is activated is kept in
+/// `before`, if that is given.
+pub fn dense(
+    y: &mut [f32],
+    before: Option<&mut [f32]>,
+    x: &[f32],
+    w: &[f32],
+    b: &[f32],
+    shape: DenseShape,
+    activation: Activation,
+) {
     let rows = shape.rows_per_task(shape.batch);
-    let members = y.par_chunks_mut(shape.batch * shape.output).enumerate();
-    members.for_each(|(member, y)| {
+    let tasks = shape.batch.div_ceil(rows);
+    let work = |task: usize, y: &mut [f32], before: Option<&mut [f32]>| {
+        let (member, first) = (task / tasks, task % tasks * rows);
         let x = Matrix::new(shape.input_of(x, member), shape.input);
-        let w = shape.weight_of(w, member);
         let b = &b[member * shape.output..][..shape.output];
-        y.par_chunks_mut(rows * shape.output).enumerate().for_each(|(task, y)| {
-            let first = task * rows;
-            let count = y.len() / shape.output;
-            matmul(y, x.rows(first, first + count), w, false);
+        matmul(y, x.rows(first, first + y.len() / shape.output), shape.weight_of(w, member), false);
+        if let Some(before) = before {
+            add_and_activate(y, b, Activation::Identity);
+            before.copy_from_slice(y);
+            activate_all(y, activation);
+        } else {
             add_and_activate(y, b, activation);
-        });
-    });
+        }
+    };
+    let parts = shape.tasks(y, rows).into_par_iter();
+    match before.map(|before| shape.tasks(before, rows)) {
+        Some(kept) => parts.zip(kept).enumerate().for_each(|(task, (y, before))| work(task, y, Some(before))),
+        None => parts.enumerate().for_each(|(task, y)| work(task, y, None)),
+    }
 }
 
 vectorised_fn! {
@@ -269,15 +291,8 @@ fn for_rows(y: &mut [f32], b: &[f32], f: impl Fn(f32) -> f32) {
     }
 }
 
-/// `y = activation(y)`.
-pub fn activate(y: &mut [f32], activation: Activation) {
-    if activation != Activation::Identity {
-        let chunk = y.len().div_ceil(rayon::current_num_threads()).max(16_384);
-        y.par_chunks_mut(chunk).for_each(|y| activate_all(y, activation));
-    }
-}
-
 vectorised_fn! {
+    /// `y = activation(y)`.
     fn activate_all(y: &'a mut [f32], activation: Activation) {
         match activation {
             Activation::Identity => {}

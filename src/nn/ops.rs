@@ -51,13 +51,6 @@ pub enum Learning {
     Frozen,
 }
 
-/// Activates `y`; returns what it was before. The gradient of a ReLU can be told from its result, that of a SiLU cannot.
-fn before_activation(y: &mut [f32], activation: Activation) -> Vec<f32> {
-    let before = y.to_vec();
-    kernels::activate(y, activation);
-    before
-}
-
 /// `activation(x w + b)`: x `[members or 1, batch, input]`, w `[members, input, output]`,
 /// b `[members, 1, output]`. An input of one member is given to all networks.
 pub fn dense<T: Tape<f32, Cpu>>(
@@ -76,10 +69,9 @@ pub fn dense<T: Tape<f32, Cpu>>(
     let shape = DenseShape { members, batch, input, output, shared_input: x_members == 1 };
 
     let mut y = vec![0.0; members * batch * output];
-    let keeps = T::OWNS_TAPE && activation == Activation::Silu;
-    let fused = if keeps { Activation::Identity } else { activation };
-    kernels::dense(&mut y, values(&x), values(w), values(b), shape, fused);
-    let before = keeps.then(|| before_activation(&mut y, activation));
+    // The gradient of a ReLU can be told from its result, that of a SiLU cannot.
+    let mut before = (T::OWNS_TAPE && activation == Activation::Silu).then(|| vec![0.0; y.len()]);
+    kernels::dense(&mut y, before.as_deref_mut(), values(&x), values(w), values(b), shape, activation);
     let y = x.device().tensor_from_vec(y, (members, batch, output));
 
     if T::OWNS_TAPE {
@@ -87,15 +79,29 @@ pub fn dense<T: Tape<f32, Cpu>>(
         tape.add_backward_op(move |gradients| {
             let mut dz = take(gradients, &y)?;
             kernels::through_activation(&mut dz, before.as_deref().unwrap_or(values(&y)), activation);
-            if learning != Learning::Frozen {
-                let mut db = take(gradients, &b)?;
-                let dw = gradients.get_or_alloc_mut(&w)?;
-                kernels::dense_parameter_gradients(dw, &mut db, values(&x), &dz, shape);
+            // Both at once: neither waits for the other's last task.
+            let (to_parameters, to_input) = (learning != Learning::Frozen, learning != Learning::FromData);
+            let mut of_parameters =
+                to_parameters.then(|| Ok((take(gradients, &w)?, take(gradients, &b)?))).transpose()?;
+            let mut of_input = to_input.then(|| take(gradients, &x)).transpose()?;
+            rayon::join(
+                || {
+                    if let Some((dw, db)) = &mut of_parameters {
+                        kernels::dense_parameter_gradients(dw, db, values(&x), &dz, shape);
+                    }
+                },
+                || {
+                    if let Some(dx) = &mut of_input {
+                        kernels::dense_input_gradient(dx, &dz, values(&w), shape);
+                    }
+                },
+            );
+            if let Some((dw, db)) = of_parameters {
+                **gradients.get_or_alloc_mut(&w)? = dw;
                 **gradients.get_or_alloc_mut(&b)? = db;
             }
-            if learning != Learning::FromData {
-                let dx = gradients.get_or_alloc_mut(&x)?;
-                kernels::dense_input_gradient(dx, &dz, values(&w), shape);
+            if let Some(dx) = of_input {
+                **gradients.get_or_alloc_mut(&x)? = dx;
             }
             Ok(())
         });
