@@ -28,7 +28,7 @@ use crate::rng::Rng;
 
 /// A feature that moves less than this share of its typical size counts as still.
 const STILL: f32 = 1e-3;
-/// Rows that one thread gathers before another may: copies are quick.
+/// Rows that one thread gathers at a time.
 const ROWS_AT_A_TIME: usize = 256;
 /// Rows held out at most: enough to judge by.
 const MAX_HELD_OUT: usize = 2000;
