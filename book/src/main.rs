@@ -189,9 +189,9 @@ fn notebooks(root: &Path, names: &[String]) -> Result<()> {
         let known: Vec<&str> = chapters.iter().map(|chapter| chapter.name.as_str()).collect();
         bail!("there is no chapter `{unknown}`; there are {}", known.join(", "));
     }
-    // Two at once would write the same files.
-    let lock = fs::File::create(root.join("target/notebooks.lock")).context("target/notebooks.lock")?;
-    if lock.try_lock().is_err() {
+    // Two at once would write the same files. Where files cannot be locked, nothing is known of another.
+    let lock = fs::File::open(folder.join("setup")).context("notebooks/setup")?;
+    if matches!(lock.try_lock(), Err(fs::TryLockError::WouldBlock)) {
         bail!("another `cargo book notebooks` is at work: wait for it, or end it");
     }
     for chapter in chapters {
