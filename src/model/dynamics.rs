@@ -1,19 +1,17 @@
-//! A snapshot of an ensemble that predicts: plain weights, no tape, fused layers.
+//! A snapshot of an ensemble that predicts.
 
 use dfdx::tensor::Cpu;
 
 use super::uncertainty::split;
 use super::{Layout, Normaliser};
-use crate::nn::kernels::{self, Matrix, vectorised_fn};
+use crate::nn::frozen::{Feature, FrozenMlp, PANEL, Panels};
+use crate::nn::kernels::vectorised_fn;
 use crate::nn::{Activation, Mlp, bounded_variance, ops};
-
-/// Numbers in the widest vector of any processor: as many rows go through a network at once as whole vectors hold.
-const VECTOR: usize = 16;
 
 /// Elites of an ensemble, frozen. All predictions are in physical units unless said otherwise.
 #[derive(Clone, Debug)]
 pub struct Dynamics {
-    members: Vec<Vec<Layer>>,
+    members: Vec<FrozenMlp>,
     pub(super) layout: Layout,
     actions: usize,
     pub(super) inputs: Normaliser,
@@ -21,13 +19,6 @@ pub struct Dynamics {
     /// Least precision and least variance of each output, normalised: see [`bounded_variance`].
     least: [Vec<f32>; 2],
     temperature: Vec<f32>,
-}
-
-/// Weight `[output, input]` and bias `[output]`.
-#[derive(Clone, Debug)]
-struct Layer {
-    weight: Vec<f32>,
-    bias: Vec<f32>,
 }
 
 /// What all members together say of one step, for each number of an observation that is predicted (see
@@ -45,10 +36,9 @@ pub struct Prediction {
 /// Buffers of a forward pass, to be used again.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    /// What goes into a layer, `[input, rows]`.
-    x: Vec<f32>,
-    /// What comes out, `[output, rows]`; of the last layer `[rows, output]`.
-    y: Vec<f32>,
+    panels: Panels,
+    /// The answers, row by row.
+    heads: Vec<f32>,
     /// A state with its cubes upright.
     upright: Vec<f32>,
 }
@@ -64,9 +54,7 @@ impl Dynamics {
         [max, min]: [&[f32]; 2],
         temperature: Vec<f32>,
     ) -> Self {
-        let layer =
-            |(weight, bias): (&[f32], &[f32])| Layer { weight: transposed(weight, bias.len()), bias: bias.to_vec() };
-        let members = members.map(|layers| layers.map(layer).collect()).collect();
+        let members = members.map(|layers| FrozenMlp::new(layers, Activation::Silu)).collect();
         let least = [max.iter().map(|max| (-max).exp()).collect(), min.iter().map(|min| min.exp()).collect()];
         Self { members, layout, actions, inputs, targets, least, temperature }
     }
@@ -122,8 +110,7 @@ impl Dynamics {
 
     /// The same networks on dfdx, to be differentiated.
     pub(super) fn networks(&self, cpu: &Cpu) -> Mlp {
-        let layer = |Layer { weight, bias }: &Layer| (transposed(weight, weight.len() / bias.len()), bias.clone());
-        let members: Vec<Vec<_>> = self.members.iter().map(|layers| layers.iter().map(layer).collect()).collect();
+        let members: Vec<Vec<_>> = self.members.iter().map(|member| member.layers().collect()).collect();
         Mlp::from_layers(cpu, &members, Activation::Silu)
     }
 
@@ -134,7 +121,7 @@ impl Dynamics {
 
     /// Whether the networks have a gate for each mean, behind mean and log-variance.
     pub(super) fn gated(&self) -> bool {
-        self.members[0].last().is_some_and(|head| head.bias.len() > 2 * self.outputs())
+        self.members[0].outputs() > 2 * self.outputs()
     }
 
     /// What one member says of the given rows of states and actions, `[rows, 2 outputs]`: changes, and then standard
@@ -147,57 +134,52 @@ impl Dynamics {
         actions: &[f32],
         scratch: &'a mut Scratch,
     ) -> &'a mut [f32] {
-        let Scratch { x, y, upright } = scratch;
+        let Scratch { panels, heads, upright } = scratch;
         let state_of = |row: usize| &states[row * self.layout.width..][..self.layout.width];
-        let count = rows.clone().count();
-        // Whole vectors of rows; what stands in the rows beyond the last is nobody's.
-        let padded = count.next_multiple_of(VECTOR);
-        x.resize(self.inputs.mean.len() * padded, 0.0);
-        for (place, row) in rows.clone().enumerate() {
-            let (mut state, action) = (state_of(row), &actions[row * self.actions..][..self.actions]);
-            if !self.layout.cubes.is_empty() {
-                upright.clear();
-                upright.extend_from_slice(state);
-                self.layout.upright(upright, None);
-                state = upright;
+        let network = &self.members[member];
+        heads.clear();
+        let mut left = rows.clone().peekable();
+        while left.peek().is_some() {
+            let x = panels.input(network.inputs());
+            let mut count = 0;
+            for (place, row) in left.by_ref().take(PANEL).enumerate() {
+                let (mut state, action) = (state_of(row), &actions[row * self.actions..][..self.actions]);
+                if !self.layout.cubes.is_empty() {
+                    upright.clear();
+                    upright.extend_from_slice(state);
+                    self.layout.upright(upright, None);
+                    state = upright;
+                }
+                let read = self.layout.read(state).chain(action.iter().copied());
+                x.iter_mut().zip(read).for_each(|(x, value)| x.0[place] = value);
+                count += 1;
             }
-            let read = self.layout.read(state).chain(action.iter().copied());
-            let features = self.inputs.mean.iter().zip(&self.inputs.scale);
-            for ((x, value), (mean, scale)) in x[place..].iter_mut().step_by(padded).zip(read).zip(features) {
-                *x = (value - mean) / scale;
-            }
+            normalise(x, &self.inputs.mean, &self.inputs.scale);
+            let y = network.forward(panels);
+            (0..count).for_each(|place| heads.extend(y.iter().map(|y| y.0[place])));
         }
-        let (head, hidden) = self.members[member].split_last().expect("a network has layers");
-        for Layer { weight, bias } in hidden {
-            y.resize(bias.len() * padded, 0.0);
-            kernels::matmul(y, Matrix::new(weight, weight.len() / bias.len()), Matrix::new(x, padded), false);
-            kernels::add_to_rows_and_activate(y, bias, Activation::Silu);
-            std::mem::swap(x, y);
-        }
-        y.resize(padded * head.bias.len(), 0.0);
-        let weight = Matrix::new(&head.weight, head.weight.len() / head.bias.len());
-        kernels::matmul(y, Matrix::new(x, padded).t(), weight.t(), false);
-        y.truncate(count * head.bias.len());
-        kernels::add_and_activate(y, &head.bias, Activation::Identity);
         if self.gated() {
-            ops::gate_rows(y, self.outputs());
+            ops::gate_rows(heads, self.outputs());
         }
         let Normaliser { mean, scale } = &self.targets;
         let [precision, variance] = &self.least;
-        denormalise(y, mean, scale, precision, variance, &self.temperature);
+        denormalise(heads, mean, scale, precision, variance, &self.temperature);
         if !self.layout.cubes.is_empty() {
-            for (row, head) in rows.zip(y.chunks_exact_mut(2 * self.outputs())) {
+            for (row, head) in rows.zip(heads.chunks_exact_mut(2 * self.outputs())) {
                 let (changes, deviations) = head.split_at_mut(self.outputs());
                 self.layout.name_back(state_of(row), changes, deviations);
             }
         }
-        y
+        heads
     }
 }
 
-/// A row-major matrix of so many columns, transposed.
-fn transposed(matrix: &[f32], columns: usize) -> Vec<f32> {
-    (0..columns).flat_map(|column| matrix.iter().skip(column).step_by(columns)).copied().collect()
+vectorised_fn! {
+    fn normalise(x: &'a mut [Feature], mean: &'a [f32], scale: &'a [f32]) {
+        for (x, (mean, scale)) in x.iter_mut().zip(mean.iter().zip(scale)) {
+            x.0.iter_mut().for_each(|x| *x = (*x - mean) / scale);
+        }
+    }
 }
 
 vectorised_fn! {

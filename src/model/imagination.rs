@@ -11,10 +11,11 @@ use serde::{Deserialize, Serialize};
 use super::Dynamics;
 use super::dynamics::Scratch;
 use crate::env::KnownReward;
+use crate::nn::frozen::PANEL;
 use crate::rng::{self, Rng};
 
-/// Rows that one thread puts through a network at a time: enough for a fast matrix product, few enough for its cache.
-const ROWS: usize = 192;
+/// Rows that one thread puts through a network at a time: few enough for its cache.
+const ROWS: usize = 12 * PANEL;
 
 /// How uncertainty is carried from step to step (Chua et al. 2018, section 5).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -171,7 +171,7 @@ pub fn softplus(x: f32) -> f32 {
 
 #[inline(always)]
 pub(crate) fn silu(x: f32) -> f32 {
-    x * sigmoid(x)
+    x / (1.0 + exp(-x))
 }
 
 #[inline(always)]
@@ -264,20 +264,6 @@ vectorised_fn! {
             Activation::Identity => for_rows(y, b, |x| x),
             Activation::Relu => for_rows(y, b, |x| x.max(0.0)),
             Activation::Silu => for_rows(y, b, silu),
-        }
-    }
-}
-
-vectorised_fn! {
-    /// `y = activation(y + b)` for rows of y, with one number of b for each.
-    pub fn add_to_rows_and_activate(y: &'a mut [f32], b: &'a [f32], activation: Activation) {
-        let width = y.len() / b.len();
-        for (row, b) in y.chunks_exact_mut(width).zip(b) {
-            match activation {
-                Activation::Identity => row.iter_mut().for_each(|y| *y += b),
-                Activation::Relu => row.iter_mut().for_each(|y| *y = (*y + b).max(0.0)),
-                Activation::Silu => row.iter_mut().for_each(|y| *y = silu(*y + b)),
-            }
         }
     }
 }

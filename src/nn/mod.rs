@@ -7,6 +7,7 @@
 
 mod adam;
 pub mod categorical;
+pub(crate) mod frozen;
 mod gaussian;
 pub mod kernels;
 pub(crate) mod layers;
