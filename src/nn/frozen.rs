@@ -14,8 +14,12 @@ const BLOCK: usize = 10;
 
 /// One feature of all rows of a panel, on cache lines of its own.
 #[derive(Clone, Copy, Debug)]
-#[repr(align(64))]
+#[repr(C, align(64))]
 pub struct Feature(pub [f32; PANEL]);
+
+// SAFETY: nothing but numbers, and no padding between them: two cache lines are `PANEL` of them.
+unsafe impl bytemuck::Zeroable for Feature {}
+unsafe impl bytemuck::Pod for Feature {}
 
 /// Buffers of a forward pass, to be used again. They grow, and never shrink.
 #[derive(Debug, Default)]
@@ -161,17 +165,24 @@ fn sums<S: Simd, const OUTPUTS: usize>(
     bias: &[f32; BLOCK],
     first: usize,
 ) {
-    for row in (0..PANEL / S::F32_LANES).step_by(2) {
+    let vectors = PANEL / S::F32_LANES;
+    // Once, and not in the loop, where its checks would stand in debug builds.
+    let x = S::as_simd_f32s(bytemuck::cast_slice(x)).0;
+    let y = S::as_mut_simd_f32s(bytemuck::cast_slice_mut(&mut y[first..first + OUTPUTS])).0;
+    for row in (0..vectors).step_by(2) {
         let mut sums: [[S::f32s; 2]; OUTPUTS] = std::array::from_fn(|o| [simd.splat_f32s(bias[first + o]); 2]);
-        for (x, weight) in x.iter().zip(weight) {
-            let x = &S::as_simd_f32s(&x.0).0[row..row + 2];
-            for (sum, weight) in sums.iter_mut().zip(&weight[first..]) {
-                let weight = simd.splat_f32s(*weight);
-                *sum = [simd.mul_add_f32s(weight, x[0], sum[0]), simd.mul_add_f32s(weight, x[1], sum[1])];
+        let mut at = row;
+        for weight in weight {
+            let (low, high) = (x[at], x[at + 1]);
+            for o in 0..OUTPUTS {
+                let weight = simd.splat_f32s(weight[first + o]);
+                let [sum_low, sum_high] = sums[o];
+                sums[o] = [simd.mul_add_f32s(weight, low, sum_low), simd.mul_add_f32s(weight, high, sum_high)];
             }
+            at += vectors;
         }
-        for (y, sum) in y[first..].iter_mut().zip(&sums) {
-            S::as_mut_simd_f32s(&mut y.0).0[row..row + 2].copy_from_slice(sum);
+        for (y, sum) in y.chunks_exact_mut(vectors).zip(&sums) {
+            (y[row], y[row + 1]) = (sum[0], sum[1]);
         }
     }
 }
