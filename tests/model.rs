@@ -114,6 +114,17 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
     }
 }
 
+/// The same bits, however many cores the networks learn on.
+#[test]
+fn what_is_learned_does_not_depend_on_threads() {
+    let said = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+        let dynamics = pool.install(|| fitted(EnsembleConfig { first_steps: 60, ..config() })).dynamics();
+        dynamics.predict(&seen(0.3, 0.1), &[0.4])
+    };
+    assert_eq!(said(1), said(3));
+}
+
 #[test]
 fn members_disagree_where_nothing_was_seen() {
     let dynamics = fitted(config()).dynamics();

@@ -4,7 +4,7 @@ use dfdx::tensor::Cpu;
 
 use super::uncertainty::split;
 use super::{Layout, Normaliser};
-use crate::nn::frozen::{Feature, FrozenMlp, PANEL, Panels};
+use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
 use crate::nn::kernels::vectorised_fn;
 use crate::nn::{Activation, Mlp, bounded_variance, ops};
 
@@ -16,8 +16,8 @@ pub struct Dynamics {
     actions: usize,
     pub(super) inputs: Normaliser,
     pub(super) targets: Normaliser,
-    /// Least precision and least variance of each output, normalised: see [`bounded_variance`].
-    least: [Vec<f32>; 2],
+    /// Least precision and least variance of each output, normalised, for each member: see [`bounded_variance`].
+    least: Vec<[Vec<f32>; 2]>,
     temperature: Vec<f32>,
 }
 
@@ -36,6 +36,8 @@ pub struct Prediction {
 /// Buffers of a forward pass, to be used again.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
+    /// The rows that are asked for.
+    rows: Vec<usize>,
     panels: Panels,
     /// The answers, row by row.
     heads: Vec<f32>,
@@ -44,18 +46,18 @@ pub(super) struct Scratch {
 }
 
 impl Dynamics {
-    #[allow(clippy::too_many_arguments)] // made in one place, by the ensemble
     pub(super) fn new<'a>(
-        members: impl Iterator<Item = impl Iterator<Item = (&'a [f32], &'a [f32])>>,
+        members: impl Iterator<Item = (FrozenMlp, [&'a [f32]; 2])>,
         layout: Layout,
         actions: usize,
         inputs: Normaliser,
         targets: Normaliser,
-        [max, min]: [&[f32]; 2],
         temperature: Vec<f32>,
     ) -> Self {
-        let members = members.map(|layers| FrozenMlp::new(layers, Activation::Silu)).collect();
-        let least = [max.iter().map(|max| (-max).exp()).collect(), min.iter().map(|min| min.exp()).collect()];
+        let least = |[max, min]: [&[f32]; 2]| {
+            [max.iter().map(|max| (-max).exp()).collect(), min.iter().map(|min| min.exp()).collect()]
+        };
+        let (members, least) = members.map(|(network, bounds)| (network, least(bounds))).unzip();
         Self { members, layout, actions, inputs, targets, least, temperature }
     }
 
@@ -129,20 +131,20 @@ impl Dynamics {
     pub(super) fn ask<'a>(
         &self,
         member: usize,
-        rows: impl Iterator<Item = usize> + Clone,
+        rows: impl Iterator<Item = usize>,
         states: &[f32],
         actions: &[f32],
         scratch: &'a mut Scratch,
     ) -> &'a mut [f32] {
-        let Scratch { panels, heads, upright } = scratch;
+        let Scratch { rows: asked, panels, heads, upright } = scratch;
         let state_of = |row: usize| &states[row * self.layout.width..][..self.layout.width];
         let network = &self.members[member];
+        asked.clear();
+        asked.extend(rows);
         heads.clear();
-        let mut left = rows.clone().peekable();
-        while left.peek().is_some() {
+        for rows in asked.chunks(PANEL) {
             let x = panels.input(network.inputs());
-            let mut count = 0;
-            for (place, row) in left.by_ref().take(PANEL).enumerate() {
+            for (place, &row) in rows.iter().enumerate() {
                 let (mut state, action) = (state_of(row), &actions[row * self.actions..][..self.actions]);
                 if !self.layout.cubes.is_empty() {
                     upright.clear();
@@ -152,33 +154,24 @@ impl Dynamics {
                 }
                 let read = self.layout.read(state).chain(action.iter().copied());
                 x.iter_mut().zip(read).for_each(|(x, value)| x.0[place] = value);
-                count += 1;
             }
-            normalise(x, &self.inputs.mean, &self.inputs.scale);
+            self.inputs.normalise_panel(x);
             let y = network.forward(panels);
-            (0..count).for_each(|place| heads.extend(y.iter().map(|y| y.0[place])));
+            (0..rows.len()).for_each(|place| heads.extend(y.iter().map(|y| y.0[place])));
         }
         if self.gated() {
             ops::gate_rows(heads, self.outputs());
         }
         let Normaliser { mean, scale } = &self.targets;
-        let [precision, variance] = &self.least;
+        let [precision, variance] = &self.least[member];
         denormalise(heads, mean, scale, precision, variance, &self.temperature);
         if !self.layout.cubes.is_empty() {
-            for (row, head) in rows.zip(heads.chunks_exact_mut(2 * self.outputs())) {
+            for (&row, head) in asked.iter().zip(heads.chunks_exact_mut(2 * self.outputs())) {
                 let (changes, deviations) = head.split_at_mut(self.outputs());
                 self.layout.name_back(state_of(row), changes, deviations);
             }
         }
         heads
-    }
-}
-
-vectorised_fn! {
-    fn normalise(x: &'a mut [Feature], mean: &'a [f32], scale: &'a [f32]) {
-        for (x, (mean, scale)) in x.iter_mut().zip(mean.iter().zip(scale)) {
-            x.0.iter_mut().for_each(|x| *x = (*x - mean) / scale);
-        }
     }
 }
 

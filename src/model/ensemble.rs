@@ -6,8 +6,8 @@
 //! of; what each of them calls uncertain is chance.
 //!
 //! Deviations from PETS: targets are normalised as well as inputs (a cube moves by millimetres, a hand by centimetres),
-//! the bounds of the log-variance are constant unless asked otherwise (as mbrl-lib has it), each network stops at
-//! its own best moment, and weights decay as in AdamW.
+//! the bounds of the log-variance are constant unless asked otherwise (as mbrl-lib has it) and each network's own, each
+//! network stops at its own best moment, and weights decay as in AdamW.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -19,17 +19,16 @@ use serde::{Deserialize, Serialize};
 use super::{Dynamics, Layout, Normaliser};
 use crate::env::Spec;
 use crate::error::{Error, Result};
+use crate::nn::frozen::FrozenMlp;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Norm, Parameters, Tensor3,
-    Weights, bounded_nll, device, ops, tensor, values,
+    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Norm, Tensor3, Weights,
+    bounded_nll, device, ops, parameters_of_fields, tensor, values,
 };
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 
 /// A feature that moves less than this share of its typical size counts as still.
 const STILL: f32 = 1e-3;
-/// Rows that one thread gathers at a time.
-const ROWS_AT_A_TIME: usize = 256;
 /// Rows held out at most: enough to judge by.
 const MAX_HELD_OUT: usize = 2000;
 /// A network has become better when its error fell by this share.
@@ -141,13 +140,11 @@ pub struct Fit {
 /// The networks, and what belongs to them.
 pub struct Ensemble {
     config: EnsembleConfig,
-    cpu: Cpu,
     layout: Layout,
     /// Typical size of each number of an observation.
     sizes: Vec<f32>,
     actions: usize,
-    learner: Learner,
-    optimiser: Adam,
+    members: Vec<Member>,
     inputs: Normaliser,
     targets: Normaliser,
     /// Factor of the predicted deviation of each output, fitted on held-out transitions.
@@ -176,19 +173,22 @@ impl Ensemble {
             activation: Activation::Silu,
             init: Init::TruncatedNormal,
         };
+        let networks = Mlp::new(&cpu, &shape, rng);
         let optimiser = AdamConfig { weight_decay: config.weight_decay, ..AdamConfig::new(config.learning_rate) };
+        let member = |i: usize| {
+            let bounds = LogVarianceBounds::new(&cpu, outputs);
+            Member { learner: Learner { network: networks.member(&cpu, i), bounds }, optimiser: Adam::new(optimiser) }
+        };
         Ok(Self {
             layout,
             sizes: spec.observation.iter().map(|feature| feature.scale).collect(),
             actions,
-            learner: Learner { networks: Mlp::new(&cpu, &shape, rng), bounds: LogVarianceBounds::new(&cpu, outputs) },
-            optimiser: Adam::new(optimiser),
+            members: (0..config.members).map(member).collect(),
             inputs: Normaliser::identity(inputs),
             targets: Normaliser::identity(outputs),
             temperature: vec![1.0; outputs],
             elites: (0..config.elites).collect(),
             fits: 0,
-            cpu,
             config,
         })
     }
@@ -219,25 +219,23 @@ impl Ensemble {
         let (mut steps, mut loss, mut stale) = (0, 0.0, 0);
         while steps < limit && stale < self.config.patience {
             let round = self.config.check_every.min(limit - steps);
-            for _ in 0..round {
-                loss += f64::from(self.learn(&data, &mut schedules, rng));
-            }
+            loss += self.learn(&data, &mut schedules, round, rng);
             steps += round;
             if judges.is_empty() {
                 continue;
             }
             let mut better = false;
-            for (member, error) in self.errors(&data, judges).into_iter().enumerate() {
-                if error < best[member].error * (1.0 - IMPROVEMENT) {
-                    best[member] = Best { error, parameters: Some(self.parameters_of(member)) };
+            for ((best, error), member) in best.iter_mut().zip(self.errors(&data, judges)).zip(&self.members) {
+                if error < best.error * (1.0 - IMPROVEMENT) {
+                    *best = Best { error, learner: Some(member.learner.clone()) };
                     better = true;
                 }
             }
             stale = if better { 0 } else { stale + 1 };
         }
-        for (member, best) in best.iter().enumerate() {
-            if let Some(parameters) = &best.parameters {
-                self.restore(member, parameters);
+        for (member, best) in self.members.iter_mut().zip(&mut best) {
+            if let Some(learner) = best.learner.take() {
+                member.learner = learner;
             }
         }
         self.elites = (0..self.config.members).collect();
@@ -252,12 +250,11 @@ impl Ensemble {
     /// What predicts and plans: a snapshot of the elites.
     pub fn dynamics(&self) -> Dynamics {
         Dynamics::new(
-            self.elites.iter().map(|&member| self.learner.networks.layers_of(member)),
+            self.elites.iter().map(|&member| self.members[member].learner.frozen()),
             self.layout.clone(),
             self.actions,
             self.inputs.clone(),
             self.targets.clone(),
-            [values(&self.learner.bounds.max), values(&self.learner.bounds.min)],
             self.temperature.clone(),
         )
     }
@@ -293,41 +290,34 @@ impl Ensemble {
         Data { rows: data.len(), inputs, targets }
     }
 
-    /// One gradient step of every network on a minibatch of its own. Returns the loss.
-    fn learn(&mut self, data: &Data, schedules: &mut [Schedule], rng: &mut Rng) -> f32 {
+    /// Gradient steps of every network, each on a minibatch of its own. Returns the sum of their losses.
+    fn learn(&mut self, data: &Data, schedules: &mut [Schedule], steps: usize, rng: &mut Rng) -> f64 {
         let batch = self.config.batch.min(schedules[0].lessons.len());
-        let rows: Vec<usize> = schedules.iter_mut().flat_map(|schedule| schedule.next(batch, rng)).collect();
-        let shape = |width| (self.config.members, batch, width);
-        let x = tensor(&self.cpu, gather(&data.inputs, &rows, data.rows), shape(data.inputs.len() / data.rows));
-        let y = tensor(&self.cpu, gather(&data.targets, &rows, data.rows), shape(data.targets.len() / data.rows));
-        let head = self.head(x.leaky_traced(), Learning::FromData);
-        let learning = if self.config.learn_bounds { Learning::Trained } else { Learning::Frozen };
-        let loss = bounded_nll(head, &y, &self.learner.bounds, self.config.beta, learning);
-        let answer = values(&loss)[0];
-        let mut gradients = loss.sum().backward();
-        self.optimiser.step(&mut self.learner, &mut gradients);
-        answer
-    }
-
-    /// Means and raw log-variances, `[members, batch, 2 outputs]`.
-    fn head<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Learning) -> Tensor3<T> {
-        let head = self.learner.networks.forward(x, learning);
-        if self.config.gated { ops::gated(head) } else { head }
+        let mut lessons: Vec<Vec<Vec<usize>>> = vec![vec![]; schedules.len()];
+        for _ in 0..steps {
+            for (lessons, schedule) in lessons.iter_mut().zip(schedules.iter_mut()) {
+                lessons.push(schedule.next(batch, rng));
+            }
+        }
+        let config = &self.config;
+        let members = self.members.par_iter_mut().zip(lessons);
+        let losses: Vec<f64> = members
+            .map(|(member, lessons)| lessons.iter().map(|rows| f64::from(member.learn(data, rows, config))).sum())
+            .collect();
+        losses.iter().sum()
     }
 
     /// Mean squared error of each network's mean on the given rows, in normalised units.
     fn errors(&self, data: &Data, rows: &[usize]) -> Vec<f64> {
-        let (head, targets) = self.judged(data, rows);
+        let (heads, targets) = self.judged(data, rows);
         let outputs = self.temperature.len();
-        let per_member = head.chunks_exact(rows.len() * 2 * outputs);
-        per_member
-            .map(|head| {
-                let pairs = head.chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs));
-                let squares =
-                    pairs.flat_map(|(head, target)| head.iter().zip(target).map(|(m, t)| f64::from(m - t).powi(2)));
-                squares.sum::<f64>() / targets.len() as f64
-            })
-            .collect()
+        let error = |head: &Vec<f32>| {
+            let pairs = head.chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs));
+            let squares =
+                pairs.flat_map(|(head, target)| head.iter().zip(target).map(|(m, t)| f64::from(m - t).powi(2)));
+            squares.sum::<f64>() / targets.len() as f64
+        };
+        heads.iter().map(error).collect()
     }
 
     /// For each output the root mean square of (target - mean) / deviation over elites and held-out rows: what the
@@ -337,14 +327,13 @@ impl Ensemble {
         if rows.is_empty() {
             return;
         }
-        let (head, targets) = self.judged(data, rows);
-        let bounds = [values(&self.learner.bounds.max), values(&self.learner.bounds.min)];
+        let (heads, targets) = self.judged(data, rows);
         let mut squares = vec![0.0_f64; outputs];
         for &member in &self.elites {
-            let head = &head[member * rows.len() * 2 * outputs..][..rows.len() * 2 * outputs];
-            for (head, target) in head.chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs)) {
+            let [max, min] = self.members[member].learner.bounds();
+            for (head, target) in heads[member].chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs)) {
                 for i in 0..outputs {
-                    let log_variance = crate::nn::bounded(head[outputs + i], bounds[0][i], bounds[1][i]);
+                    let log_variance = crate::nn::bounded(head[outputs + i], max[i], min[i]);
                     squares[i] += f64::from((target[i] - head[i]).powi(2) * (-log_variance).exp());
                 }
             }
@@ -354,36 +343,20 @@ impl Ensemble {
         self.temperature = squares.iter().map(root).collect();
     }
 
-    /// What all networks say of some rows, `[members, rows, 2 outputs]`, and the targets there.
-    fn judged(&self, data: &Data, rows: &[usize]) -> (Vec<f32>, Vec<f32>) {
-        let inputs = gather(&data.inputs, rows, data.rows);
-        let x = tensor(&self.cpu, inputs, (1, rows.len(), data.inputs.len() / data.rows));
-        let head = self.head(x, Learning::Frozen);
-        (values(&head).to_vec(), gather(&data.targets, rows, data.rows))
-    }
-
-    fn parameters_of(&self, member: usize) -> Vec<Vec<f32>> {
-        let parameters = self.learner.networks.parameters().into_iter();
-        parameters
-            .map(|(_, parameter)| {
-                let size = values(parameter).len() / self.config.members;
-                values(parameter)[member * size..][..size].to_vec()
-            })
-            .collect()
-    }
-
-    fn restore(&mut self, member: usize, saved: &[Vec<f32>]) {
-        for ((_, parameter), saved) in self.learner.networks.parameters_mut().into_iter().zip(saved) {
-            let mut all = values(parameter).to_vec();
-            all[member * saved.len()..][..saved.len()].copy_from_slice(saved);
-            parameter.copy_from(&all);
-        }
+    /// What each network says of some rows, `[rows, 2 outputs]`, and the targets there.
+    fn judged(&self, data: &Data, rows: &[usize]) -> (Vec<Vec<f32>>, Vec<f32>) {
+        let x = data.inputs_of(rows);
+        let head =
+            |member: &Member| values(&member.learner.head(x.clone(), self.config.gated, Learning::Frozen)).to_vec();
+        (self.members.par_iter().map(head).collect(), values(&data.targets_of(rows)).to_vec())
     }
 
     /// What it has learned.
     pub fn weights(&self) -> Weights {
         let mut weights = Weights::default();
-        weights.insert_module("ensemble", &self.learner);
+        for (i, member) in self.members.iter().enumerate() {
+            weights.insert_module(&member_name(i), &member.learner);
+        }
         self.inputs.save(&mut weights, "inputs");
         self.targets.save(&mut weights, "targets");
         weights.insert("temperature", self.temperature.clone(), [1, 1, self.temperature.len()]);
@@ -401,7 +374,9 @@ impl Ensemble {
         let elites = weights.counts("elites", self.config.elites)?;
         let temperature = weights.get("temperature", [1, 1, self.temperature.len()])?.to_vec();
         self.fits = weights.counts("fits", 1)?[0] as usize;
-        weights.load_module("ensemble", &mut self.learner)?;
+        for (i, member) in self.members.iter_mut().enumerate() {
+            weights.load_module(&member_name(i), &mut member.learner)?;
+        }
         self.inputs.load(weights, "inputs")?;
         self.targets.load(weights, "targets")?;
         self.elites = elites.into_iter().map(|member| member as usize).collect();
@@ -409,9 +384,11 @@ impl Ensemble {
         Ok(())
     }
 
-    /// Writes the state of its optimiser into `state`.
+    /// Writes the state of its optimisers into `state`.
     pub fn save_training_state(&self, state: &mut Weights) {
-        self.optimiser.save(state, "ensemble");
+        for (i, member) in self.members.iter().enumerate() {
+            member.optimiser.save(state, &member_name(i));
+        }
     }
 
     /// Reads what [`Ensemble::save_training_state`] wrote.
@@ -419,7 +396,60 @@ impl Ensemble {
     /// # Errors
     /// If it is missing or of other sizes.
     pub fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        self.optimiser.load(state, "ensemble", &self.learner)
+        for (i, member) in self.members.iter_mut().enumerate() {
+            member.optimiser.load(state, &member_name(i), &member.learner)?;
+        }
+        Ok(())
+    }
+}
+
+/// What a network's numbers stand under in a file.
+fn member_name(member: usize) -> String {
+    format!("ensemble.{member}")
+}
+
+/// One of the networks. They share nothing but the data, so each learns on a core of its own.
+struct Member {
+    learner: Learner,
+    optimiser: Adam,
+}
+
+impl Member {
+    /// One gradient step on the given rows. Returns the loss.
+    fn learn(&mut self, data: &Data, rows: &[usize], config: &EnsembleConfig) -> f32 {
+        let head = self.learner.head(data.inputs_of(rows).leaky_traced(), config.gated, Learning::FromData);
+        let learning = if config.learn_bounds { Learning::Trained } else { Learning::Frozen };
+        let loss = bounded_nll(head, &data.targets_of(rows), &self.learner.bounds, config.beta, learning);
+        let answer = values(&loss)[0];
+        self.optimiser.step(&mut self.learner, &mut loss.sum().backward());
+        answer
+    }
+}
+
+/// What gradients train of a network. Bounds that are not learned have no gradient, and stay.
+#[derive(Clone)]
+struct Learner {
+    network: Mlp,
+    bounds: LogVarianceBounds,
+}
+
+parameters_of_fields!(Learner: network, bounds);
+
+impl Learner {
+    /// Means and raw log-variances, `[1, batch, 2 outputs]`.
+    fn head<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, gated: bool, learning: Learning) -> Tensor3<T> {
+        let head = self.network.forward(x, learning);
+        if gated { ops::gated(head) } else { head }
+    }
+
+    /// What predicts, and its bounds.
+    fn frozen(&self) -> (FrozenMlp, [&[f32]; 2]) {
+        (FrozenMlp::new(self.network.layers_of(0), Activation::Silu), self.bounds())
+    }
+
+    /// Upper and lower bounds of the log-variances.
+    fn bounds(&self) -> [&[f32]; 2] {
+        [values(&self.bounds.max), values(&self.bounds.min)]
     }
 }
 
@@ -430,16 +460,36 @@ struct Data {
     targets: Vec<f32>,
 }
 
+impl Data {
+    /// Inputs of the given rows, `[1, rows, inputs]`.
+    fn inputs_of(&self, rows: &[usize]) -> Tensor3 {
+        gather(&self.inputs, rows, self.rows)
+    }
+
+    /// Targets of the given rows, `[1, rows, outputs]`.
+    fn targets_of(&self, rows: &[usize]) -> Tensor3 {
+        gather(&self.targets, rows, self.rows)
+    }
+}
+
+/// The given rows of a table of `count` rows.
+fn gather(table: &[f32], rows: &[usize], count: usize) -> Tensor3 {
+    let width = table.len() / count;
+    let mut gathered = Vec::with_capacity(rows.len() * width);
+    rows.iter().for_each(|row| gathered.extend_from_slice(&table[row * width..][..width]));
+    tensor(&device(), gathered, (1, rows.len(), width))
+}
+
 /// The best that a network was during a fit.
 struct Best {
     error: f64,
     /// None if nobody judged.
-    parameters: Option<Vec<Vec<f32>>>,
+    learner: Option<Learner>,
 }
 
 impl Default for Best {
     fn default() -> Self {
-        Self { error: f64::INFINITY, parameters: None }
+        Self { error: f64::INFINITY, learner: None }
     }
 }
 
@@ -464,32 +514,5 @@ impl Schedule {
         }
         self.next += count;
         self.lessons[self.next - count..self.next].to_vec()
-    }
-}
-
-/// The given rows of a table of `count` rows.
-fn gather(table: &[f32], rows: &[usize], count: usize) -> Vec<f32> {
-    let width = table.len() / count;
-    let mut gathered = vec![0.0; rows.len() * width];
-    let copies = gathered.par_chunks_mut(ROWS_AT_A_TIME * width).zip(rows.par_chunks(ROWS_AT_A_TIME));
-    copies.for_each(|(to, rows)| {
-        to.chunks_exact_mut(width).zip(rows).for_each(|(to, row)| to.copy_from_slice(&table[row * width..][..width]));
-    });
-    gathered
-}
-
-/// Everything that gradients train. Bounds that are not learned have no gradient, and stay.
-struct Learner {
-    networks: Mlp,
-    bounds: LogVarianceBounds,
-}
-
-impl Parameters for Learner {
-    fn parameters(&self) -> Vec<(String, &Tensor3)> {
-        [self.networks.parameters(), self.bounds.parameters()].concat()
-    }
-
-    fn parameters_mut(&mut self) -> Vec<(String, &mut Tensor3)> {
-        self.networks.parameters_mut().into_iter().chain(self.bounds.parameters_mut()).collect()
     }
 }

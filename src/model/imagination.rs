@@ -401,6 +401,8 @@ impl Luck {
 mod tests {
     use super::*;
     use crate::model::{Layout, Normaliser};
+    use crate::nn::Activation;
+    use crate::nn::frozen::FrozenMlp;
 
     /// Two members of one number and one action: the number drifts by `drift`, up with the first member, down with the
     /// second, plus the action, with a deviation of `deviation`.
@@ -410,11 +412,14 @@ mod tests {
             (vec![0.0, 0.0, 1.0, 0.0], vec![drift, 2.0 * deviation.ln()])
         };
         let members = [layer(drift), layer(-drift)];
-        let layers = members.iter().map(|(weight, bias)| std::iter::once((&weight[..], &bias[..])));
+        let members = members.iter().map(|(weight, bias)| {
+            let network = FrozenMlp::new(std::iter::once((&weight[..], &bias[..])), Activation::Silu);
+            (network, [&[5.0][..], &[-40.0]])
+        });
         let identity = Normaliser::identity;
         let layout =
             Layout { width: 1, inputs: vec![0], near: vec![], predicted: vec![0], differences: vec![], cubes: vec![] };
-        Dynamics::new(layers, layout, 1, identity(2), identity(1), [&[5.0], &[-40.0]], vec![1.0])
+        Dynamics::new(members, layout, 1, identity(2), identity(1), vec![1.0])
     }
 
     struct Position;

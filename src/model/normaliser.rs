@@ -2,6 +2,8 @@
 
 use crate::error::Result;
 use crate::nn::Weights;
+use crate::nn::frozen::Feature;
+use crate::nn::kernels::vectorised_fn;
 
 /// Mean and scale of each of several features.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,6 +49,11 @@ impl Normaliser {
         }
     }
 
+    /// Normalises a panel in place.
+    pub(super) fn normalise_panel(&self, panel: &mut [Feature]) {
+        normalise_panel(panel, &self.mean, &self.scale);
+    }
+
     /// Writes it into `weights`, under `prefix`.
     pub fn save(&self, weights: &mut Weights, prefix: &str) {
         let size = [1, 1, self.mean.len()];
@@ -64,6 +71,14 @@ impl Normaliser {
         let scale = weights.get(&format!("{prefix}.scale"), size)?.to_vec();
         *self = Self { mean, scale };
         Ok(())
+    }
+}
+
+vectorised_fn! {
+    fn normalise_panel(panel: &'a mut [Feature], mean: &'a [f32], scale: &'a [f32]) {
+        for (Feature(x), (mean, scale)) in panel.iter_mut().zip(mean.iter().zip(scale)) {
+            x.iter_mut().for_each(|x| *x = (*x - mean) / scale);
+        }
     }
 }
 

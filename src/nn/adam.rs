@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::kernels::vectorised_fn;
-use super::{Parameters, Weights, values};
+use super::{Parameters, Weights, values, values_mut};
 use crate::error::Result;
 
 /// Settings of [`Adam`].
@@ -96,18 +96,17 @@ impl Adam {
         work.par_iter_mut().for_each(|(name, parameter, gradient, [first, second])| {
             let decay =
                 if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
-            let mut updated = values(parameter).to_vec();
+            let parameter = values_mut(parameter);
             let adaptive = self.config.adaptive_clip.map_or(1.0, |share| {
-                let [size, slope] = [&updated, &*gradient].map(|numbers| sum_of_squares(numbers).sqrt() as f32);
+                let [size, slope] = [&*parameter, &*gradient].map(|numbers| sum_of_squares(numbers).sqrt() as f32);
                 (share * size.max(1e-3) / slope.max(f32::MIN_POSITIVE)).min(1.0)
             });
             let rule = Rule { decay, clip: clip * adaptive, ..rule };
             if self.config.normalise_first {
-                update_normalised(&mut updated, gradient, first, second, rule);
+                update_normalised(parameter, gradient, first, second, rule);
             } else {
-                update(&mut updated, gradient, first, second, rule);
+                update(parameter, gradient, first, second, rule);
             }
-            parameter.copy_from(&updated);
         });
         self.moments = work.into_iter().map(|(name, _, _, moments)| (name, moments)).collect();
         norm

@@ -4,7 +4,7 @@
 use pulp::Simd;
 
 use super::Activation;
-use super::kernels::silu;
+use super::kernels::activate;
 
 /// Rows that walk through a network together: two vectors of the widest kind.
 pub const PANEL: usize = 32;
@@ -144,13 +144,7 @@ impl pulp::WithSimd for Product<'_> {
                 sums::<S, { BLOCK / 2 }>(simd, y, x, weight, bias, 0);
                 sums::<S, { BLOCK / 2 }>(simd, y, x, weight, bias, BLOCK / 2);
             }
-            for Feature(y) in y {
-                match activation {
-                    Activation::Identity => {}
-                    Activation::Relu => y.iter_mut().for_each(|y| *y = y.max(0.0)),
-                    Activation::Silu => y.iter_mut().for_each(|y| *y = silu(*y)),
-                }
-            }
+            activate(bytemuck::cast_slice_mut(y), activation);
         }
     }
 }
@@ -166,20 +160,17 @@ fn sums<S: Simd, const OUTPUTS: usize>(
     first: usize,
 ) {
     let vectors = PANEL / S::F32_LANES;
-    // Once, and not in the loop, where its checks would stand in debug builds.
     let x = S::as_simd_f32s(bytemuck::cast_slice(x)).0;
     let y = S::as_mut_simd_f32s(bytemuck::cast_slice_mut(&mut y[first..first + OUTPUTS])).0;
     for row in (0..vectors).step_by(2) {
         let mut sums: [[S::f32s; 2]; OUTPUTS] = std::array::from_fn(|o| [simd.splat_f32s(bias[first + o]); 2]);
-        let mut at = row;
-        for weight in weight {
-            let (low, high) = (x[at], x[at + 1]);
+        for (weight, x) in weight.iter().zip(x.chunks_exact(vectors)) {
+            let (low, high) = (x[row], x[row + 1]);
             for o in 0..OUTPUTS {
                 let weight = simd.splat_f32s(weight[first + o]);
                 let [sum_low, sum_high] = sums[o];
                 sums[o] = [simd.mul_add_f32s(weight, low, sum_low), simd.mul_add_f32s(weight, high, sum_high)];
             }
-            at += vectors;
         }
         for (y, sum) in y.chunks_exact_mut(vectors).zip(&sums) {
             (y[row], y[row + 1]) = (sum[0], sum[1]);

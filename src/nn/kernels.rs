@@ -170,12 +170,12 @@ pub fn softplus(x: f32) -> f32 {
 }
 
 #[inline(always)]
-pub(crate) fn silu(x: f32) -> f32 {
+pub(super) fn silu(x: f32) -> f32 {
     x / (1.0 + exp(-x))
 }
 
 #[inline(always)]
-pub(crate) fn silu_slope(x: f32) -> f32 {
+pub(super) fn silu_slope(x: f32) -> f32 {
     let s = sigmoid(x);
     s * (1.0 + x * (1.0 - s))
 }
@@ -278,13 +278,18 @@ fn for_rows(y: &mut [f32], b: &[f32], f: impl Fn(f32) -> f32) {
 }
 
 vectorised_fn! {
-    /// `y = activation(y)`.
     fn activate_all(y: &'a mut [f32], activation: Activation) {
-        match activation {
-            Activation::Identity => {}
-            Activation::Relu => y.iter_mut().for_each(|y| *y = y.max(0.0)),
-            Activation::Silu => y.iter_mut().for_each(|y| *y = silu(*y)),
-        }
+        activate(y, activation);
+    }
+}
+
+/// `y = activation(y)`, to be inlined where vectors are in use.
+#[inline(always)]
+pub(super) fn activate(y: &mut [f32], activation: Activation) {
+    match activation {
+        Activation::Identity => {}
+        Activation::Relu => y.iter_mut().for_each(|y| *y = y.max(0.0)),
+        Activation::Silu => y.iter_mut().for_each(|y| *y = silu(*y)),
     }
 }
 

@@ -4,7 +4,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use super::ops::{self, Learning, Tensor3, values};
+use super::ops::{self, Learning, Tensor3, values, values_mut};
 use super::parameters::Parameters;
 use super::{Activation, norm};
 use crate::rng::{self, Rng};
@@ -120,8 +120,7 @@ impl Mlp {
     /// Multiplies the weights of the last layer by `factor`: with 0, the network says the same of everything at first.
     pub fn scale_output(mut self, factor: f32) -> Self {
         let last = self.layers.last_mut().expect("a layer");
-        let scaled: Vec<f32> = values(&last.weight).iter().map(|w| factor * w).collect();
-        last.weight.copy_from(&scaled);
+        values_mut(&mut last.weight).iter_mut().for_each(|w| *w *= factor);
         self
     }
 
@@ -152,6 +151,12 @@ impl Mlp {
             &numbers[member * size..][..size]
         };
         self.layers.iter().map(move |layer| (of_member(&layer.weight), of_member(&layer.bias)))
+    }
+
+    /// One of the networks, on its own. Layer normalisation does not come along.
+    pub fn member(&self, cpu: &Cpu, member: usize) -> Self {
+        let layers = self.layers_of(member).map(|(weight, bias)| (weight.to_vec(), bias.to_vec())).collect();
+        Self::from_layers(cpu, &[layers], self.layers[0].activation)
     }
 
     /// The outputs for `x` (`[members or 1, batch, input]`).

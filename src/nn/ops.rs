@@ -35,6 +35,20 @@ pub fn values<T>(tensor: &Tensor3<T>) -> &[f32] {
     unsafe { std::slice::from_raw_parts(first, len) }
 }
 
+/// The same, to be changed. Numbers that the tensor shares with its clones are copied first.
+///
+/// # Panics
+/// If the tensor is a broadcast or permuted view.
+pub fn values_mut(tensor: &mut Tensor3) -> &mut [f32] {
+    let len = values(tensor).len();
+    if len == 0 {
+        return &mut [];
+    }
+    let first = std::ptr::from_mut(&mut tensor[[0; 3]]);
+    // SAFETY: as in `values`; dfdx's `IndexMut` has just made the tensor the only owner of its numbers.
+    unsafe { std::slice::from_raw_parts_mut(first, len) }
+}
+
 /// Takes the gradient of an operation's result out of the store; nothing else will need it.
 pub(crate) fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<Vec<f32>, CpuError> {
     Ok(std::mem::take(gradients.get_or_alloc_mut(of)?))

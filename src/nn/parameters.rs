@@ -1,7 +1,7 @@
 //! What learns: named parameters, and what is done with all of them at once.
 
 use super::kernels;
-use super::ops::{Tensor3, values};
+use super::ops::{Tensor3, values, values_mut};
 
 /// Something with named parameters, each `[members, rows, columns]`.
 pub trait Parameters {
@@ -14,13 +14,11 @@ pub trait Parameters {
 /// Moves `target` towards `source`: `target <- (1 - rate) target + rate source`.
 pub fn polyak<P: Parameters>(target: &mut P, source: &P, rate: f32) {
     for ((_, target), (_, source)) in target.parameters_mut().into_iter().zip(source.parameters()) {
-        let mut mixed = values(target).to_vec();
         kernels::vectorised(|| {
-            for (t, s) in mixed.iter_mut().zip(values(source)) {
+            for (t, s) in values_mut(target).iter_mut().zip(values(source)) {
                 *t += rate * (s - *t);
             }
         });
-        target.copy_from(&mixed);
     }
 }
 

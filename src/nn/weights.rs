@@ -19,7 +19,7 @@ pub struct Weights {
 impl Weights {
     /// Adds an array.
     pub fn insert(&mut self, name: impl Into<String>, numbers: Vec<f32>, shape: [usize; 3]) {
-        debug_assert_eq!(numbers.len(), shape.iter().product::<usize>());
+        assert_eq!(numbers.len(), shape.iter().product::<usize>());
         self.arrays.insert(name.into(), (numbers, shape));
     }
 
