@@ -4,6 +4,7 @@ use std::path::Path;
 
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
@@ -13,6 +14,9 @@ use crate::error::{Error, Result};
 use crate::files;
 
 const SIZE: (u32, u32) = (820, 440);
+
+/// The methods that have the palette's colours in every figure of every study. Others take what is left.
+const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "planet", "scripted", "random"];
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
@@ -76,7 +80,7 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
             chart
                 .draw_series(DashedLineSeries::new(ends, 7, 5, color.stroke_width(2)))?
                 .label(format!("{method} (does not learn)"))
-                .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], color.stroke_width(2)));
+                .legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 22, y)], 5, 3, color.stroke_width(2)));
         }
         legend(&mut chart, SeriesLabelPosition::LowerRight)?;
         Ok(())
@@ -305,10 +309,17 @@ fn legend<'a, 'b: 'a>(chart: &mut Chart<'a, 'b>, position: SeriesLabelPosition) 
     Ok(())
 }
 
-/// The methods of a task, each with its colour, the same in every figure.
+/// The methods of a task, each with its colour.
 fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
     let of_task = tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task).map(|(_, method)| method);
-    Ok(PALETTE.iter().cycle().copied().zip(of_task).collect())
+    let of_task: Vec<String> = of_task.collect();
+    let left = COLOURED.iter().zip(PALETTE).filter(|(known, _)| !of_task.iter().any(|method| method == *known));
+    let mut left = left.map(|(_, colour)| colour).collect::<Vec<_>>().into_iter();
+    let mut colour_of = |method: &String| match COLOURED.iter().position(|known| known == method) {
+        Some(place) => PALETTE[place],
+        None => left.next().unwrap_or(GREY),
+    };
+    Ok(of_task.into_iter().map(|method| (colour_of(&method), method)).collect())
 }
 
 /// Steps common to all seeds, with the lowest, mean and highest value at each.
