@@ -11,7 +11,7 @@ use super::ops::{Learning, Tensor3, take, values};
 /// Weight of the penalty that draws learned bounds together.
 const BOUND_PENALTY: f32 = 0.01;
 
-/// The range of log-variances, for each output: `[1, 1, outputs]`, shared by all networks.
+/// The range of log-variances, for each output: `[1, 1, outputs]`, the same for all networks of a loss.
 #[derive(Clone, Debug)]
 pub struct LogVarianceBounds {
     /// Upper bounds.
