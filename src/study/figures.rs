@@ -22,11 +22,12 @@ type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
 
 /// Success over environment steps for one task: a line for the mean of each learning method, its band from the
-/// worst seed to the best, and a dashed line for each method that does not learn.
+/// worst seed to the best, and a dashed line for each method that does not learn. False, and nothing drawn, if none
+/// learns.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
-pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
+pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<bool> {
     let mut learning = Vec::new();
     let mut fixed = Vec::new();
     for (color, method) in methods(tables, task)? {
@@ -37,8 +38,10 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
             learning.push((color, method, curves));
         }
     }
-    let budget = learning.iter().flat_map(|(_, _, curves)| curves).filter_map(|(x, _)| x.last().copied());
-    let budget = budget.fold(1.0, f64::max);
+    let lasts = learning.iter().flat_map(|(_, _, curves)| curves).filter_map(|(x, _)| x.last().copied());
+    let Some(budget) = lasts.reduce(f64::max) else {
+        return Ok(false);
+    };
     draw(path, |area| {
         let mut chart = ChartBuilder::on(&area)
             .caption(format!("{task}: success over environment steps"), (FONT, 20))
@@ -84,10 +87,11 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         }
         legend(&mut chart, SeriesLabelPosition::LowerRight)?;
         Ok(())
-    })
+    })?;
+    Ok(true)
 }
 
-/// The test of every method on one task: success with its 95 % interval, and smoothness of the hand.
+/// The test of every method on one task: success with its 95 % interval, and smoothness of the hand if there is one.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -99,11 +103,10 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         let sparc = value("smoothness_sparc")?;
         rows.push((color, method, success, sparc));
     }
-    let roughest = rows.iter().filter_map(|(.., sparc)| *sparc).fold(-2.0, f64::min);
+    let roughest = rows.iter().filter_map(|(.., sparc)| *sparc).reduce(f64::min);
     let count = rows.len();
     draw(path, |area| {
         let area = area.margin(14, 10, 10, 10).titled(&format!("{task}: the test at the end"), (FONT, 20))?;
-        let (left, right) = area.split_horizontally(470);
         let panel = |area: &Area, title: &str, left_margin: u32, from: f64, to: f64, percent: bool| -> Drawn {
             let mut chart = ChartBuilder::on(area)
                 .caption(title, (FONT, 15))
@@ -139,8 +142,14 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
             }
             Ok(())
         };
-        panel(&left, "success, 95 % interval", 110, 0.0, 1.03, true)?;
-        panel(&right, "smoothness (SPARC; a perfect movement has -1.4)", 0, roughest * 1.1, -1.0, false)
+        let success = |area: &Area| panel(area, "success, 95 % interval", 110, 0.0, 1.03, true);
+        let Some(roughest) = roughest else {
+            return success(&area);
+        };
+        let (left, right) = area.split_horizontally(470);
+        success(&left)?;
+        let from = 1.1 * roughest.min(-2.0);
+        panel(&right, "smoothness (SPARC; a perfect movement has -1.4)", 0, from, -1.0, false)
     })
 }
 

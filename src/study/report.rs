@@ -35,11 +35,13 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     );
     for task in &tasks {
         let (curves, tests) = (format!("{task}-learning.svg"), format!("{task}-test.svg"));
-        figures::learning_curves(&tables, task, &to.join(&curves))?;
-        figures::tests(&tables, task, &to.join(&tests))?;
         write!(text, "\n## {task}\n\n").expect("text grows");
         text += &findings(&tables, task)?;
-        write!(text, "\n![Success of each method on {task} over environment steps]({curves})\n").expect("text grows");
+        if figures::learning_curves(&tables, task, &to.join(&curves))? {
+            write!(text, "\n![Success of each method on {task} over environment steps]({curves})\n")
+                .expect("text grows");
+        }
+        figures::tests(&tables, task, &to.join(&tests))?;
         write!(text, "\n![Success and smoothness of each method on {task} in the test]({tests})\n")
             .expect("text grows");
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
