@@ -174,14 +174,15 @@ fn main() -> ExitCode {
     }
 }
 
-/// The first Ctrl-C asks runs to finish their episode and save; the second ends the program.
+/// The first Ctrl-C asks runs to finish their episode (in a test, the episodes that are played side by side) and to save; the
+/// second ends the program.
 fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> Result<()> {
     let stop = Arc::clone(stop);
     ctrlc::set_handler(move || {
         if stop.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
-        eprintln!("\nfinishing the present episode and saving; press Ctrl-C again to give that up");
+        eprintln!("\nfinishing the episodes that have begun and saving; press Ctrl-C again to give that up");
     })
     .map_err(|problem| Error::BadSetting(format!("cannot watch for Ctrl-C: {problem}")))
 }

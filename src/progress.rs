@@ -24,6 +24,7 @@ struct Shown {
     bar: Option<ProgressBar>,
     last_return: Option<f64>,
     success: Option<f64>,
+    tested: Option<usize>,
 }
 
 impl Progress {
@@ -34,6 +35,7 @@ impl Progress {
             bar: None,
             last_return: None,
             success: None,
+            tested: None,
         };
         Self {
             bars: MultiProgress::new(),
@@ -53,8 +55,9 @@ impl Shown {
         let show = |value: Option<f64>, name: &str, digits: usize| {
             value.map_or(String::new(), |v| format!("{name} {v:.digits$}  "))
         };
-        let success = self.success.map_or(String::new(), |s| format!("success {:.0} %", 100.0 * s));
-        show(self.last_return, "return", 1) + &success
+        let success = self.success.map_or(String::new(), |s| format!("success {:.0} %  ", 100.0 * s));
+        let tested = self.tested.map_or(String::new(), |episodes| format!("{episodes} test episodes"));
+        show(self.last_return, "return", 1) + &success + &tested
     }
 }
 
@@ -72,7 +75,7 @@ impl Observer for Progress {
             ProgressBar::new(config.steps as u64).with_style(style)
         } else {
             ProgressBar::new_spinner()
-                .with_style(ProgressStyle::with_template("{prefix:24} {spinner} testing").expect("our template"))
+                .with_style(ProgressStyle::with_template("{prefix:24} {spinner} testing  {msg}").expect("our template"))
         };
         let bar = self.bars.add(bar);
         bar.set_prefix(shown.name.clone());
@@ -99,6 +102,10 @@ impl Observer for Progress {
                 shown.success = Some(row.success);
                 let (percent, total) = (100.0 * row.success, row.return_mean);
                 Some(format!("{name}: {done}/{} steps, return {total:.1}, success {percent:.0} %", config.steps))
+            }
+            Event::Testing(episodes) => {
+                shown.tested = Some(*episodes);
+                Some(format!("{name}: {episodes} of {} test episodes", config.test_episodes))
             }
             Event::Tested(test) => {
                 let summary = test.summary();

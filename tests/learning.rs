@@ -270,6 +270,28 @@ fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {
     assert!(is_complete(&whole) && is_complete(&halves));
 }
 
+/// Also for those who need no training, but long to be tested.
+#[test]
+fn a_test_goes_on_where_it_stopped() {
+    for method in ["random", "oracle"] {
+        let mut config = RunConfig::new(Task::Pendulum, method, 0, None, None).expect("a preset");
+        config.test_episodes = 21;
+        if let Some(oracle) = &mut config.oracle {
+            let quick = IcemConfig { horizon: 2, population: 4, elites: 2, iterations: 1, ..IcemConfig::default() };
+            oracle.planner = PlannerConfig::Icem(quick);
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
+        finish(&mut Run::open(config.clone(), &whole).expect("a new run"));
+        let first = Run::open(config.clone(), &halves).expect("a new run").step().expect("a healthy run");
+        assert!(matches!(first, Event::Testing(20)), "{first:?}");
+        let last = Run::open(config, &halves).expect("a run to go on with").step().expect("a healthy run");
+        assert!(matches!(&last, Event::Tested(test) if test.episodes.len() == 21), "{last:?}");
+        let [whole, halves] = [whole, halves].map(|run| std::fs::read_to_string(run.join("test.csv")).expect("a test"));
+        assert_eq!(whole, halves, "{method}");
+    }
+}
+
 #[test]
 fn a_trained_agent_comes_back_from_its_folder() {
     let folder = tempfile::tempdir().expect("a folder");

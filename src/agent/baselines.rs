@@ -43,9 +43,10 @@ impl Scripted {
     }
 }
 
-/// What there is to say of an agent that never learns.
+/// What there is to say of an agent that never learns. If it draws random numbers, from a field that is named here, it goes
+/// on with them after a stop.
 macro_rules! never_learns {
-    () => {
+    ($($rng:ident)?) => {
         fn observe(&mut self, _transition: &crate::replay::Transition) {}
 
         fn update(&mut self) -> Option<crate::agent::Losses> {
@@ -60,11 +61,16 @@ macro_rules! never_learns {
             Ok(())
         }
 
+        #[allow(unused_mut)]
         fn training_state(&self) -> crate::nn::Weights {
-            crate::nn::Weights::default()
+            let mut state = crate::nn::Weights::default();
+            $(state.insert_counts("rng", &crate::rng::state(&self.$rng));)?
+            state
         }
 
-        fn load_training_state(&mut self, _state: &crate::nn::Weights) -> crate::error::Result<()> {
+        #[allow(unused_variables)]
+        fn load_training_state(&mut self, state: &crate::nn::Weights) -> crate::error::Result<()> {
+            $(self.$rng = crate::rng::from_state(&state.counts("rng", 4)?);)?
             Ok(())
         }
     };
@@ -77,7 +83,7 @@ impl Agent for Random {
         (0..self.actions).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect()
     }
 
-    never_learns!();
+    never_learns!(rng);
 }
 
 impl Agent for Scripted {

@@ -108,5 +108,5 @@ impl Agent for Oracle {
         seats.iter().map(|seat| self.plan(seat)).collect()
     }
 
-    never_learns!();
+    never_learns!(rng);
 }

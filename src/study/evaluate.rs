@@ -55,14 +55,15 @@ pub struct Episode {
     pub ldlj: Option<f64>,
 }
 
-/// What an evaluation found.
-#[derive(Clone, Debug, PartialEq)]
+/// What an evaluation has found so far.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
     /// The episodes, in the order of their starts.
     pub episodes: Vec<Episode>,
-    /// Time to choose one action, ms, when asked for one at a time.
+    /// Time to choose one action at the start of an episode, ms, when asked for one at a time.
     pub action_ms: f64,
-    /// The episodes themselves, for those who judge models by them.
+    /// The episodes themselves, for those who judge models by them; not kept on disk.
+    #[serde(skip)]
     pub traces: Vec<Trace>,
 }
 
@@ -130,26 +131,35 @@ impl Judge {
     /// # Errors
     /// If there are no episodes, or the agent's actions cannot be taken.
     pub fn evaluate(&mut self, agent: &mut dyn Agent, episodes: usize, starts: Starts) -> Result<Evaluation> {
+        let mut evaluation = Evaluation::default();
+        while !self.go_on(&mut evaluation, agent, episodes, starts)? {}
+        Ok(evaluation)
+    }
+
+    /// Adds to an evaluation of so many episodes the next group of those that are played side by side, and answers whether
+    /// these were the last: for whoever wants to see, or to keep, what there is before the end.
+    ///
+    /// # Errors
+    /// As for [`Judge::evaluate`].
+    pub fn go_on(
+        &mut self,
+        evaluation: &mut Evaluation,
+        agent: &mut dyn Agent,
+        episodes: usize,
+        starts: Starts,
+    ) -> Result<bool> {
         if episodes == 0 {
             return Err(Error::BadSetting("an evaluation needs at least one episode".into()));
         }
-        let mut judged = Vec::with_capacity(episodes);
-        let mut traces = Vec::with_capacity(episodes);
-        let mut action_ms = 0.0;
-        for first in (0..episodes).step_by(WORLDS) {
-            let seeds: Vec<u64> = (first..episodes.min(first + WORLDS)).map(|i| starts.seed(i)).collect();
-            judged.extend(self.side_by_side(agent, &seeds, &mut action_ms, &mut traces)?);
+        let done = evaluation.episodes.len();
+        let seeds: Vec<u64> = (done..episodes.min(done + WORLDS)).map(|i| starts.seed(i)).collect();
+        if !seeds.is_empty() {
+            self.side_by_side(evaluation, agent, &seeds)?;
         }
-        Ok(Evaluation { episodes: judged, action_ms, traces })
+        Ok(evaluation.episodes.len() >= episodes)
     }
 
-    fn side_by_side(
-        &mut self,
-        agent: &mut dyn Agent,
-        seeds: &[u64],
-        action_ms: &mut f64,
-        traces: &mut Vec<Trace>,
-    ) -> Result<Vec<Episode>> {
+    fn side_by_side(&mut self, evaluation: &mut Evaluation, agent: &mut dyn Agent, seeds: &[u64]) -> Result<()> {
         let dt = self.worlds.envs()[0].spec().dt;
         let mut observations = self.worlds.reset(seeds);
         let mut paths: Vec<Vec<[f64; 3]>> =
@@ -160,7 +170,7 @@ impl Judge {
         let starts = observations.iter().map(|obs| Trace { observations: vec![obs.clone()], ..Trace::default() });
         let mut traced: Vec<Trace> = starts.collect();
         let seat = Seat { number: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
-        *action_ms = time_of_action(agent, seat);
+        evaluation.action_ms = time_of_action(agent, seat);
         let mut first = true;
         while !running.is_empty() {
             let envs = self.worlds.envs();
@@ -189,17 +199,18 @@ impl Judge {
                 observations[i] = step.observation;
             }
         }
-        traces.extend(traced);
         for (episode, path) in episodes.iter_mut().zip(&paths) {
             if let Some((sparc, ldlj)) = smoothness::of_path(path, dt) {
                 (episode.sparc, episode.ldlj) = (Some(sparc), Some(ldlj));
             }
         }
-        Ok(episodes)
+        evaluation.episodes.extend(episodes);
+        evaluation.traces.extend(traced);
+        Ok(())
     }
 }
 
-/// Milliseconds that one action takes: the median of a few.
+/// Milliseconds that one action takes at the start of an episode: the median of a few.
 fn time_of_action(agent: &mut dyn Agent, seat: Seat) -> f64 {
     let mut times: Vec<f64> = (0..5)
         .map(|_| {

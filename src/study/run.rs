@@ -146,6 +146,9 @@ struct Progress {
     model: Vec<ModelRow>,
     #[serde(default)]
     values: Vec<ValueRow>,
+    /// The test, as far as it has come.
+    #[serde(default)]
+    test: Evaluation,
     /// Sum and count of each loss since the last row of it.
     pending: BTreeMap<String, (f32, usize)>,
 }
@@ -159,7 +162,9 @@ pub enum Event {
     EpisodeEnded(EpisodeRow),
     /// An evaluation during training.
     Evaluated(EvaluationRow),
-    /// The test at the end; the run is complete.
+    /// So many episodes of the test at the end are judged and saved; more are to come.
+    Testing(usize),
+    /// The whole test; the run is complete.
     Tested(Evaluation),
 }
 
@@ -236,7 +241,7 @@ impl Run {
         self.episode_length == 0
     }
 
-    /// Acts and learns for one step; at the end of the budget, runs the test. Saves when it is time.
+    /// Acts and learns for one step; at the end of the budget, goes on with the test. Saves when it is time.
     ///
     /// # Errors
     /// If an action cannot be taken or a file cannot be written.
@@ -331,15 +336,19 @@ impl Run {
     }
 
     fn test(&mut self) -> Result<Event> {
-        let episodes = self.config.test_episodes;
-        let test = self.judge.evaluate(self.agent.as_mut(), episodes, Starts::Test)?;
+        let (test, agent) = (&mut self.progress.test, self.agent.as_mut());
+        let complete = self.judge.go_on(test, agent, self.config.test_episodes, Starts::Test)?;
         self.save()?;
+        let test = &self.progress.test;
+        if !complete {
+            return Ok(Event::Testing(test.episodes.len()));
+        }
         let rows = test.episodes.iter().enumerate();
         let rows = rows.map(|(i, episode)| (i + 1, episode));
         write_csv(&self.folder.join("test.csv"), &TEST_COLUMNS, rows)?;
         let summary = toml::to_string(&test.summary()).expect("a summary is TOML");
         files::write(&self.folder.join("summary.toml"), summary.as_bytes())?;
-        Ok(Event::Tested(test))
+        Ok(Event::Tested(test.clone()))
     }
 
     /// Writes the checkpoint, the weights and the CSV files. A run that is resumed starts its
@@ -352,11 +361,11 @@ impl Run {
         self.clock = Instant::now();
         self.last_save = self.clock;
         let weights = self.agent.weights();
+        let mut state = self.agent.training_state();
+        state.absorb("weights.", &weights);
+        state.set_note("progress", serde_json::to_string(&self.progress).expect("progress is JSON"));
+        state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
         if self.config.learns() {
-            let mut state = self.agent.training_state();
-            state.absorb("weights.", &weights);
-            state.set_note("progress", serde_json::to_string(&self.progress).expect("progress is JSON"));
-            state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
             weights.write(&self.folder.join("weights.safetensors"))?;
         }
         let Progress { episodes, evaluations, losses, model, values, .. } = &self.progress;
