@@ -101,9 +101,11 @@ fn a_small_study_from_start_to_report() {
     std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
     let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);
     assert!(report.status.success(), "{}", text(&report.stderr));
-    let [first, second] =
-        ["study/report.md", "elsewhere/report.md"].map(|f| std::fs::read_to_string(here.join(f)).expect(f));
-    assert_eq!(first, second);
+    for file in ["summary.csv", "report.md"] {
+        let [first, second] =
+            ["study", "elsewhere"].map(|folder| std::fs::read_to_string(here.join(folder).join(file)).expect(file));
+        assert_eq!(first, second);
+    }
 }
 
 #[test]

@@ -8,13 +8,14 @@ use super::{figures, tables};
 use crate::error::Result;
 use crate::files;
 
-/// Reads a study's tables in `from`, and writes figures and `report.md` into `to`. Returns the table
-/// of results as text.
+/// Reads a study's tables in `from`, and writes `summary.csv`, figures and `report.md` into `to`. Returns the table of
+/// results as text.
 ///
 /// # Errors
 /// If a table is missing or damaged, or a file cannot be written.
 pub fn write(from: &Path, to: &Path) -> Result<String> {
     let tables = Tables::read(from)?;
+    tables.write_summary(to)?;
     let pairs = tables.tasks_and_methods()?;
     let mut tasks: Vec<&str> = pairs.iter().map(|(task, _)| task.as_str()).collect();
     tasks.dedup();

@@ -1,6 +1,6 @@
 //! From the folders of runs to the tables of a study: `evaluations.csv`, `models.csv`, `values.csv` and `tests.csv` hold
-//! every run's numbers, `summary.csv` one row for each task and method. Figures and report are made from these
-//! files alone.
+//! every run's numbers. What follows from them (`summary.csv`, a row for each task and method; figures; report) is made
+//! from these files alone.
 
 use std::path::Path;
 
@@ -26,7 +26,7 @@ pub struct Tables {
     pub values: DataFrame,
     /// task, method, seed, episode, return, success, ...: every test episode.
     pub tests: DataFrame,
-    /// One row for each task and method.
+    /// One row for each task and method: what follows from the others.
     pub summary: DataFrame,
 }
 
@@ -63,12 +63,10 @@ impl Tables {
             let options = UnionArgs { to_supertypes: true, ..UnionArgs::default() };
             if frames.is_empty() { Ok(DataFrame::empty()) } else { concat(frames, options)?.collect() }
         };
-        let evaluations = join(evaluations).map_err(inside)?;
-        let models = join(models).map_err(inside)?;
-        let values = join(values).map_err(inside)?;
-        let tests = join(tests).map_err(inside)?;
-        let summary = summarise(&evaluations, &tests).map_err(inside)?;
-        Ok(Self { evaluations, models, values, tests, summary })
+        let joined = || -> PolarsResult<Self> {
+            Self::summarised(join(evaluations)?, join(models)?, join(values)?, join(tests)?)
+        };
+        joined().map_err(inside)
     }
 
     /// Reads the tables of a study from its folder.
@@ -76,35 +74,38 @@ impl Tables {
     /// # Errors
     /// If one is missing or damaged.
     pub fn read(folder: &Path) -> Result<Self> {
-        Ok(Self {
-            evaluations: read(&folder.join("evaluations.csv"))?,
-            models: read(&folder.join("models.csv"))?,
-            values: read(&folder.join("values.csv"))?,
-            tests: read(&folder.join("tests.csv"))?,
-            summary: read(&folder.join("summary.csv"))?,
-        })
+        let [evaluations, models, values, tests] =
+            ["evaluations.csv", "models.csv", "values.csv", "tests.csv"].map(|name| read(&folder.join(name)));
+        Self::summarised(evaluations?, models?, values?, tests?).map_err(inside)
     }
 
-    /// Writes the tables into a study's folder.
+    fn summarised(
+        evaluations: DataFrame,
+        models: DataFrame,
+        values: DataFrame,
+        tests: DataFrame,
+    ) -> PolarsResult<Self> {
+        let summary = summarise(&evaluations, &tests)?;
+        Ok(Self { evaluations, models, values, tests, summary })
+    }
+
+    /// Writes what was gathered into a study's folder.
     ///
     /// # Errors
     /// If a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
-        let tables = [
-            ("evaluations.csv", &self.evaluations),
-            ("models.csv", &self.models),
-            ("values.csv", &self.values),
-            ("tests.csv", &self.tests),
-            ("summary.csv", &self.summary),
-        ];
-        for (name, table) in tables {
-            let mut bytes = Vec::new();
-            if table.width() > 0 {
-                CsvWriter::new(&mut bytes).finish(&mut table.clone()).map_err(inside)?;
-            }
-            files::write(&folder.join(name), &bytes)?;
-        }
-        Ok(())
+        write(&folder.join("evaluations.csv"), &self.evaluations)?;
+        write(&folder.join("models.csv"), &self.models)?;
+        write(&folder.join("values.csv"), &self.values)?;
+        write(&folder.join("tests.csv"), &self.tests)
+    }
+
+    /// Writes `summary.csv` into a folder.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn write_summary(&self, folder: &Path) -> Result<()> {
+        write(&folder.join("summary.csv"), &self.summary)
     }
 
     /// Tasks and methods, in the order in which they were run.
@@ -301,6 +302,14 @@ fn read(path: &Path) -> Result<DataFrame> {
     let reader = CsvReadOptions::default().with_infer_schema_length(None);
     let reader = reader.into_reader_with_file_handle(std::io::Cursor::new(bytes));
     reader.finish().map_err(|problem| Error::bad_file(path, format!("no table of ours ({problem})")))
+}
+
+fn write(path: &Path, table: &DataFrame) -> Result<()> {
+    let mut bytes = Vec::new();
+    if table.width() > 0 {
+        CsvWriter::new(&mut bytes).finish(&mut table.clone()).map_err(inside)?;
+    }
+    files::write(path, &bytes)
 }
 
 /// A table of ours that lacks something: it was changed by hand, or comes from another version.
