@@ -3,6 +3,7 @@
 //! In a notebook a [`Chart`] that ends a cell shows itself.
 
 use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 use crate::error::{Error, Result};
@@ -170,7 +171,17 @@ impl Chart {
                 Shape::Band => chart.draw_series([Polygon::new(points, colour.mix(0.2))])?,
             };
             if !name.is_empty() {
-                series.label(name).legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], line));
+                // In the legend, a small piece of it.
+                let series = series.label(name);
+                match shape {
+                    Shape::Dashed => {
+                        series.legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 22, y)], 5, 3, line))
+                    }
+                    Shape::Points => series.legend(move |(x, y)| Circle::new((x + 11, y), 3, line.filled())),
+                    Shape::Line | Shape::Band => {
+                        series.legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], line))
+                    }
+                };
             }
         }
         if self.series.iter().filter(|series| !series.name.is_empty()).count() > 1 {
