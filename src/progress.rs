@@ -24,7 +24,7 @@ struct Shown {
     bar: Option<ProgressBar>,
     last_return: Option<f64>,
     success: Option<f64>,
-    tested: Option<usize>,
+    tested: Option<String>,
 }
 
 impl Progress {
@@ -56,8 +56,7 @@ impl Shown {
             value.map_or(String::new(), |v| format!("{name} {v:.digits$}  "))
         };
         let success = self.success.map_or(String::new(), |s| format!("success {:.0} %  ", 100.0 * s));
-        let tested = self.tested.map_or(String::new(), |episodes| format!("{episodes} test episodes"));
-        show(self.last_return, "return", 1) + &success + &tested
+        show(self.last_return, "return", 1) + &success + self.tested.as_deref().unwrap_or_default()
     }
 }
 
@@ -75,7 +74,8 @@ impl Observer for Progress {
             ProgressBar::new(config.steps as u64).with_style(style)
         } else {
             ProgressBar::new_spinner()
-                .with_style(ProgressStyle::with_template("{prefix:24} {spinner} testing  {msg}").expect("our template"))
+                .with_style(ProgressStyle::with_template("{prefix:24} {spinner} {msg}").expect("our template"))
+                .with_message("testing")
         };
         let bar = self.bars.add(bar);
         bar.set_prefix(shown.name.clone());
@@ -104,8 +104,10 @@ impl Observer for Progress {
                 Some(format!("{name}: {done}/{} steps, return {total:.1}, success {percent:.0} %", config.steps))
             }
             Event::Testing(episodes) => {
-                shown.tested = Some(*episodes);
-                Some(format!("{name}: {episodes} of {} test episodes", config.test_episodes))
+                let tested = format!("tested {episodes} of {}", config.test_episodes);
+                let line = format!("{name}: {tested}");
+                shown.tested = Some(tested);
+                Some(line)
             }
             Event::Tested(test) => {
                 let summary = test.summary();
