@@ -61,16 +61,19 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<bool>
             .y_label_formatter(&|y| format!("{:.0} %", 100.0 * y))
             .label_style((FONT, 14))
             .draw()?;
-        for (color, method, curves) in &learning {
-            let color = *color;
-            let (steps, band) = band(curves);
-            let outline = steps.iter().zip(&band).map(|(x, [low, _, _])| (*x, *low));
-            let back = steps.iter().zip(&band).rev().map(|(x, [_, _, high])| (*x, *high));
+        let bands: Vec<Band> = learning.iter().map(|(.., curves)| band(curves)).collect();
+        // All bands first: none shall lie on a line.
+        for ((color, _, curves), (steps, band)) in learning.iter().zip(&bands) {
+            let outline = steps.iter().zip(band).map(|(x, [low, _, _])| (*x, *low));
+            let back = steps.iter().zip(band).rev().map(|(x, [_, _, high])| (*x, *high));
             let polygon: Vec<(f64, f64)> = outline.chain(back).collect();
             if curves.len() > 1 {
                 chart.draw_series([Polygon::new(polygon, color.mix(0.18))])?;
             }
-            let mean = steps.iter().zip(&band).map(|(x, [_, mean, _])| (*x, *mean));
+        }
+        for ((color, method, curves), (steps, band)) in learning.iter().zip(&bands) {
+            let color = *color;
+            let mean = steps.iter().zip(band).map(|(x, [_, mean, _])| (*x, *mean));
             let label = format!("{method} ({} seed{})", curves.len(), if curves.len() == 1 { "" } else { "s" });
             chart
                 .draw_series(LineSeries::new(mean, color.stroke_width(3)))?
