@@ -114,6 +114,26 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
     }
 }
 
+/// A step size that falls brings the networks to rest: closer to the law than one that keeps them trembling to the end.
+#[test]
+fn networks_whose_steps_shorten_come_closer_to_the_law() {
+    let error = |anneal: f32| -> f64 {
+        let dynamics =
+            fitted(EnsembleConfig { anneal, held_out: 0.0, members: 1, elites: 1, learning_rate: 1e-2, ..config() })
+                .dynamics();
+        let mut rng = rng::stream(2, "test");
+        let mut square = || {
+            let obs = seen(rng::uniform(&mut rng, -0.8, 0.8) as f32, rng::uniform(&mut rng, -0.8, 0.8) as f32);
+            let action = rng::uniform(&mut rng, -1.0, 1.0) as f32;
+            let pairs = dynamics.predict(&obs, &[action]).mean.into_iter().zip(expected(&obs, action));
+            pairs.map(|(said, law)| (said - f64::from(law)).powi(2)).sum::<f64>()
+        };
+        (0..500).map(|_| square()).sum::<f64>().sqrt()
+    };
+    let (kept, shortened) = (error(1.0), error(0.05));
+    assert!(shortened < 0.6 * kept, "errors {shortened:.4} and {kept:.4}");
+}
+
 /// The same bits, however many cores the networks learn on.
 #[test]
 fn what_is_learned_does_not_depend_on_threads() {

@@ -48,6 +48,9 @@ pub struct EnsembleConfig {
     pub hidden: Vec<usize>,
     /// Step size.
     pub learning_rate: f32,
+    /// Share of the step size that is left at the end of a fit, to which it falls in a straight line; 1 keeps it. What
+    /// plans are made in at the end is then less at the mercy of the last minibatches.
+    pub anneal: f32,
     /// Decay of weights, in units of the step size.
     pub weight_decay: f32,
     /// Transitions in a minibatch of each network.
@@ -86,6 +89,7 @@ impl Default for EnsembleConfig {
             elites: 5,
             hidden: vec![200; 3],
             learning_rate: 1e-3,
+            anneal: 1.0,
             weight_decay: 1e-2,
             batch: 256,
             bootstrap: false,
@@ -121,7 +125,15 @@ impl EnsembleConfig {
         if !(0.0..0.9).contains(&self.held_out) {
             return Err(Error::BadSetting("ensemble: `held_out` must lie in [0, 0.9)".into()));
         }
+        if !(0.0..=1.0).contains(&self.anneal) {
+            return Err(Error::BadSetting("ensemble: `anneal` must lie between 0 and 1".into()));
+        }
         Ok(())
+    }
+
+    /// The size of a step, `step` steps after a fit of `steps` began.
+    fn learning_rate_at(&self, step: usize, steps: usize) -> f32 {
+        self.learning_rate * (1.0 - (1.0 - self.anneal) * step as f32 / steps as f32)
     }
 }
 
@@ -218,9 +230,10 @@ impl Ensemble {
         let mut best: Vec<Best> = (0..self.config.members).map(|_| Best::default()).collect();
         let (mut steps, mut loss, mut stale) = (0, 0.0, 0);
         while steps < limit && stale < self.config.patience {
-            let round = self.config.check_every.min(limit - steps);
-            loss += self.learn(&data, &mut schedules, round, rng);
-            steps += round;
+            let round = steps..limit.min(steps + self.config.check_every);
+            steps = round.end;
+            let rates: Vec<f32> = round.map(|step| self.config.learning_rate_at(step, limit)).collect();
+            loss += self.learn(&data, &mut schedules, &rates, rng);
             if judges.is_empty() {
                 continue;
             }
@@ -290,11 +303,11 @@ impl Ensemble {
         Data { rows: data.len(), inputs, targets }
     }
 
-    /// Gradient steps of every network, each on a minibatch of its own. Returns the sum of their losses.
-    fn learn(&mut self, data: &Data, schedules: &mut [Schedule], steps: usize, rng: &mut Rng) -> f64 {
+    /// Gradient steps of these sizes with every network, each on a minibatch of its own. Returns the sum of their losses.
+    fn learn(&mut self, data: &Data, schedules: &mut [Schedule], rates: &[f32], rng: &mut Rng) -> f64 {
         let batch = self.config.batch.min(schedules[0].lessons.len());
         let mut lessons: Vec<Vec<Vec<usize>>> = vec![vec![]; schedules.len()];
-        for _ in 0..steps {
+        for _ in rates {
             for (lessons, schedule) in lessons.iter_mut().zip(schedules.iter_mut()) {
                 lessons.push(schedule.next(batch, rng));
             }
@@ -302,7 +315,10 @@ impl Ensemble {
         let config = &self.config;
         let members = self.members.par_iter_mut().zip(lessons);
         let losses: Vec<f64> = members
-            .map(|(member, lessons)| lessons.iter().map(|rows| f64::from(member.learn(data, rows, config))).sum())
+            .map(|(member, lessons)| {
+                let steps = lessons.iter().zip(rates);
+                steps.map(|(rows, rate)| f64::from(member.learn(data, rows, *rate, config))).sum()
+            })
             .collect();
         losses.iter().sum()
     }
@@ -415,12 +431,13 @@ struct Member {
 }
 
 impl Member {
-    /// One gradient step on the given rows. Returns the loss.
-    fn learn(&mut self, data: &Data, rows: &[usize], config: &EnsembleConfig) -> f32 {
+    /// One gradient step of this size on the given rows. Returns the loss.
+    fn learn(&mut self, data: &Data, rows: &[usize], rate: f32, config: &EnsembleConfig) -> f32 {
         let head = self.learner.head(data.inputs_of(rows).leaky_traced(), config.gated, Learning::FromData);
         let learning = if config.learn_bounds { Learning::Trained } else { Learning::Frozen };
         let loss = bounded_nll(head, &data.targets_of(rows), &self.learner.bounds, config.beta, learning);
         let answer = values(&loss)[0];
+        self.optimiser.set_learning_rate(rate);
         self.optimiser.step(&mut self.learner, &mut loss.sum().backward());
         answer
     }

@@ -76,6 +76,11 @@ impl Adam {
         Self { config, steps: 0, moments: BTreeMap::new() }
     }
 
+    /// Takes steps of another size from here on.
+    pub fn set_learning_rate(&mut self, learning_rate: f32) {
+        self.config.learning_rate = learning_rate;
+    }
+
     /// One step against `gradients`. Returns their norm before clipping. A parameter on which nothing that was
     /// differentiated depends has a gradient of zero.
     pub fn step(&mut self, module: &mut impl Parameters, gradients: &mut Gradients<f32, Cpu>) -> f32 {
