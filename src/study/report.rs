@@ -29,9 +29,9 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += &markdown(&rows(&tables)?);
     text += &format!(
         "\nSuccess: share of test episodes in which the task is fulfilled at the last step, with its 95 % Wilson \
-         interval. Steps to {:.0} %: median over the seeds of the environment steps until an evaluation first reaches \
-         that success (a dash: it does not). SPARC, LDLJ: smoothness of the hand's \
-         movement; nearer to zero is smoother.\n",
+         interval. Steps to {:.0} %: median over the seeds of the environment steps after which the success curve first \
+         reaches that level, a straight line between two evaluations (a dash: it does not). SPARC, LDLJ: smoothness of \
+         the hand's movement; nearer to zero is smoother.\n",
         100.0 * LEVEL
     );
     for task in &tasks {

@@ -363,7 +363,8 @@ impl Run {
         let weights = self.agent.weights();
         let mut state = self.agent.training_state();
         state.absorb("weights.", &weights);
-        state.set_note("progress", serde_json::to_string(&self.progress).expect("progress is JSON"));
+        // TOML, since JSON has no word for a likelihood or a loss that is not a number.
+        state.set_note("progress", toml::to_string(&self.progress).expect("progress is TOML"));
         state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
         if self.config.learns() {
             weights.write(&self.folder.join("weights.safetensors"))?;
@@ -413,10 +414,9 @@ fn load(path: &Path, agent: &mut dyn Agent) -> Result<Progress> {
         Error::bad_file(path, format!("not a checkpoint of this run ({problem}); remove it to start anew"))
     };
     let state = Weights::read(path)?;
-    let progress = state
-        .note("progress")
-        .and_then(|json| serde_json::from_str(json).ok())
-        .ok_or_else(|| foreign(Error::BadSetting("it tells no progress".into())))?;
+    let progress = state.note("progress").ok_or_else(|| foreign(Error::BadSetting("it tells no progress".into())))?;
+    let progress = toml::from_str(progress)
+        .map_err(|problem| foreign(Error::BadSetting(format!("its progress: {}", problem.message()))))?;
     agent.load_weights(&state.extract("weights.")).map_err(foreign)?;
     agent.load_training_state(&state).map_err(foreign)?;
     Ok(progress)
@@ -449,4 +449,25 @@ fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<It
     composed.map_err(|problem| Error::bad_file(path, problem))?;
     let bytes = writer.into_inner().map_err(|problem| Error::bad_file(path, problem))?;
     files::write(path, &bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::env::Task;
+
+    #[test]
+    fn a_run_resumes_from_what_is_not_a_number() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let config = RunConfig::new(Task::Pendulum, "debug", 0, None, None).expect("a preset");
+        let mut run = Run::open(config.clone(), folder.path()).expect("a new run");
+        let loss = LossRow { step: 1, name: "critic".into(), value: f32::NAN };
+        let model = ModelRow { step: 1, horizon: 1, rmse: 0.1, nll: f64::INFINITY, coverage90: 0.9, rmse_p90: 0.3 };
+        run.progress.losses.push(loss);
+        run.progress.model.push(model.clone());
+        run.save().expect("a writable folder");
+        let again = Run::open(config, folder.path()).expect("a run to go on with").progress;
+        assert!(again.losses[0].value.is_nan());
+        assert_eq!(again.model, [model]);
+    }
 }
