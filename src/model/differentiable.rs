@@ -1,7 +1,8 @@
 //! Gradients of imagined returns with respect to actions, by dfdx's tape through the networks.
 //!
 //! Each member follows its own mean, without chance. A known reward is differentiated by central differences: it
-//! is a cheap function of a few numbers. Cubes are seen upright at the start, and keep those names of their axes to the end.
+//! is a cheap function of a few numbers. Cubes are seen upright at the start; their axes keep those names to the end, and are not
+//! straightened on the way.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;

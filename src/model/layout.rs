@@ -95,10 +95,12 @@ impl Layout {
         self.cubes.iter().for_each(|cube| cube.name_back(cube.upright(obs), obs, changes, deviations));
     }
 
-    /// Puts right, in an observation whose predicted numbers are new, what follows from them.
+    /// Puts right, in an observation whose predicted numbers are new, what follows from them: differences; and that the axes
+    /// of a cube are axes.
     pub fn complete(&self, obs: &mut [f32]) {
         for &[i, a, b] in &self.differences {
             obs[i] = obs[a] - obs[b];
         }
+        self.cubes.iter().for_each(|cube| cube.straighten(obs));
     }
 }
