@@ -125,6 +125,7 @@ mod tests {
     use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
     use super::*;
+    use crate::model::Layout;
     use crate::rng;
 
     const CUBE: Cube = Cube { observed: 0, predicted: 0 };
@@ -163,11 +164,14 @@ mod tests {
     #[test]
     fn bent_axes_are_straightened() {
         let mut rng = rng::stream(2, "cube");
+        let predicted = (0..6).collect();
+        let layout =
+            Layout { width: 6, inputs: vec![], near: vec![], predicted, differences: vec![], cubes: vec![CUBE] };
         for _ in 0..50 {
             let turn = lying(&mut rng);
             let straight = observed(&turn);
             let mut bent = straight.map(|a| 1.2 * a + 0.02 * rng::normal(&mut rng) as f32);
-            CUBE.straighten(&mut bent);
+            layout.complete(&mut bent);
             let [x, z] = [0, 3].map(|from| Vector3::from_fn(|i, _| f64::from(bent[from + i])));
             assert!(
                 (x.norm() - 1.0).abs() < 1e-6 && (z.norm() - 1.0).abs() < 1e-6 && x.dot(&z).abs() < 1e-6,
