@@ -8,7 +8,7 @@ use std::path::Path;
 
 use handful::agent::DreamerConfig;
 use handful::env::{Env, Spec, Task, World};
-use handful::model::open_loop::{Foresee, Trace, open_loop};
+use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
 use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, WorldModel};
 use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
@@ -26,7 +26,7 @@ const SKILL: [f64; 3] = [1.0, 0.7, 0.0];
 
 /// Episodes of the scripted policy, of a noisy one, and of noise alone.
 struct Recording {
-    traces: Vec<Trace>,
+    episodes: Vec<Episode>,
     transitions: ReplayBuffer,
     moments: SequenceReplay,
 }
@@ -37,7 +37,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
     let size = world.spec().observation_size();
     let policy = task.scripted_policy(Default::default()).ok_or("a task with a scripted policy")?;
     let mut recording = Recording {
-        traces: Vec::new(),
+        episodes: Vec::new(),
         transitions: ReplayBuffer::new(size, action_size, usize::MAX),
         moments: SequenceReplay::new(size, action_size, usize::MAX),
     };
@@ -45,15 +45,15 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
         let skill = SKILL[seed as usize % SKILL.len()];
         let noise = ColoredNoise::new(2.0, horizon).sample_actions(action_size, rng);
         let mut obs = world.reset(seed);
-        let mut trace = Trace { observations: vec![obs.clone()], ..Trace::default() };
+        let mut episode = Episode { observations: vec![obs.clone()], ..Episode::default() };
         for noise in noise.chunks_exact(action_size) {
             let mixed =
                 policy(&obs).into_iter().zip(noise).map(|(wise, wild)| skill * f64::from(wise) + (1.2 - skill) * wild);
             let action: Vec<f32> = mixed.map(|a| a.clamp(-1.0, 1.0) as f32).collect();
             let step = world.step(&action)?;
-            trace.actions.push(action.clone());
-            trace.observations.push(step.observation.clone());
-            trace.rewards.push(step.reward);
+            episode.actions.push(action.clone());
+            episode.observations.push(step.observation.clone());
+            episode.rewards.push(step.reward);
             let done = step.done();
             let transition = Transition {
                 obs: std::mem::replace(&mut obs, step.observation.clone()),
@@ -69,7 +69,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
                 break;
             }
         }
-        recording.traces.push(trace);
+        recording.episodes.push(episode);
     }
     Ok(recording)
 }
@@ -90,18 +90,18 @@ struct Alike<'a, Model> {
     spec: &'a Spec,
 }
 
-impl<Model: Foresee> Foresee for Alike<'_, Model> {
-    fn foreseen(&self) -> Vec<(usize, f32)> {
-        self.model.foreseen().into_iter().filter(|(i, _)| self.spec.observation[*i].cube.is_none()).collect()
+impl<Model: OpenLoopModel> OpenLoopModel for Alike<'_, Model> {
+    fn predicted(&self) -> Vec<(usize, f32)> {
+        self.model.predicted().into_iter().filter(|(i, _)| self.spec.observation[*i].cube.is_none()).collect()
     }
 
-    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
-        self.model.futures(starts, ahead, rng)
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        self.model.open_loop_predictions(starts, ahead, rng)
     }
 }
 
-fn judge(name: &'static str, model: &impl Foresee, spec: &Spec, traces: &[Trace], rows: &mut Vec<Row>) {
-    for row in open_loop(&Alike { model, spec }, traces, &mut rng::stream(0, "judge")) {
+fn judge(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
+    for row in open_loop(&Alike { model, spec }, episodes, &mut rng::stream(0, "judge")) {
         let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
         println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
         rows.push(Row { model: name, horizon, rmse, rmse_p90, coverage90 });
@@ -111,7 +111,7 @@ fn judge(name: &'static str, model: &impl Foresee, spec: &Spec, traces: &[Trace]
 fn study(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let mut rng = rng::stream(0, "foresight");
     let training = record(task, 0..TRAINING, &mut rng)?;
-    let held_out = record(task, 1000..1000 + HELD_OUT, &mut rng)?.traces;
+    let held_out = record(task, 1000..1000 + HELD_OUT, &mut rng)?.episodes;
     println!("{}: {} steps to learn from", task.name(), training.transitions.len());
     let world = task.make();
     let spec = world.spec();

@@ -7,7 +7,7 @@ use std::error::Error;
 
 use handful::diff::{Pusher, Recording};
 use handful::env::{Env, Task};
-use handful::model::{Ensemble, EnsembleConfig, Layout};
+use handful::model::{Ensemble, EnsembleConfig, FeatureMap};
 use handful::plan::noise::ColoredNoise;
 use handful::replay::{ReplayBuffer, Transition};
 use handful::rng;
@@ -86,7 +86,7 @@ impl Push {
     }
 
     /// What an ensemble foresees.
-    fn foreseen_by(&self, ensemble: &Ensemble, layout: &Layout) -> Vec<[f64; 3]> {
+    fn foreseen_by(&self, ensemble: &Ensemble, layout: &FeatureMap) -> Vec<[f64; 3]> {
         let dynamics = ensemble.dynamics();
         let mut obs = self.observations[0].clone();
         let mut poses = vec![pose(&obs)];
@@ -131,7 +131,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
     let spec = Task::Push.make().spec().clone();
-    let layout = Layout::new(&spec)?;
+    let layout = FeatureMap::new(&spec)?;
     let mut rows = Vec::new();
     for (i, push) in pushes.iter().enumerate() {
         println!("push {i}: {} steps, moved {:.3} m", push.actions.len(), push.moved());

@@ -58,7 +58,7 @@ fn compare<const N: usize, const M: usize>(
                 elites: 40,
                 iterations: 40,
                 decay: 1.05,
-                colour: 2.0,
+                noise_beta: 2.0,
                 ..Default::default()
             }),
         ),

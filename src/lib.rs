@@ -84,12 +84,12 @@ pub mod watch;
 /// What most programs that use this crate need.
 pub mod prelude {
     pub use crate::agent::{
-        Agent, Losses, Mode, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted, Seat,
+        Agent, Losses, Mode, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted, Slot,
     };
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};
     pub use crate::error::{Error, Result};
     pub use crate::replay::{ReplayBuffer, Transition};
-    pub use crate::study::evaluate::{Judge, Starts};
+    pub use crate::study::evaluate::{EvalSeeds, Evaluator};
 }

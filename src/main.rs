@@ -14,7 +14,7 @@ use handful::env::tabletop::TableOptions;
 use handful::env::{Env, Task};
 use handful::error::{Error, Result};
 use handful::study::config::RunConfig;
-use handful::study::evaluate::{Judge, Starts};
+use handful::study::evaluate::{EvalSeeds, Evaluator};
 use handful::study::plan::{self, Profile, StudyPlan};
 use handful::study::run::{self, trained_agent};
 use handful::watch::Recording;
@@ -275,9 +275,9 @@ fn print_test(folder: &Path) -> Result<()> {
 
 fn evaluate(args: &EvaluateArgs) -> Result<()> {
     let (config, mut agent) = trained_agent(&args.run)?;
-    let starts = args.seed.map_or(Starts::Test, Starts::Seed);
+    let starts = args.seed.map_or(EvalSeeds::Test, EvalSeeds::Seed);
     let make = || config.world();
-    let summary = Judge::new(make)?.evaluate(agent.as_mut(), args.episodes, starts)?.summary();
+    let summary = Evaluator::new(make)?.evaluate(agent.as_mut(), args.episodes, starts)?.summary();
     if args.json {
         println!("{}", serde_json::to_string_pretty(&summary).expect("a summary is JSON"));
     } else {

@@ -176,7 +176,7 @@ struct Flags {
 /// after the other (`[length, sequences, ...]`). A stretch may begin and end anywhere, and may hold the end of one episode
 /// and the beginning of the next.
 #[derive(Clone, Debug, Default)]
-pub struct Sequences {
+pub struct SequenceBatch {
     /// Stretches side by side.
     pub sequences: usize,
     /// Moments in each.
@@ -195,7 +195,7 @@ pub struct Sequences {
     pub terminal: Vec<bool>,
 }
 
-impl Sequences {
+impl SequenceBatch {
     /// The last `moments` of each stretch.
     pub fn last(&self, moments: usize) -> Self {
         let rows = moments * self.sequences;
@@ -284,12 +284,12 @@ impl SequenceReplay {
     ///
     /// # Panics
     /// If there are not so many moments.
-    pub fn sample(&self, sequences: usize, length: usize, rng: &mut Rng) -> Sequences {
+    pub fn sample(&self, sequences: usize, length: usize, rng: &mut Rng) -> SequenceBatch {
         assert!(self.len() >= length && length > 0, "enough to draw from");
         let (count, width) = (self.len(), self.width());
         let starts: Vec<usize> = (0..sequences).map(|_| rng.random_range(0..=count - length)).collect();
         let row = |i: usize| &self.rows[(self.oldest + i) % count * width..][..width];
-        let mut batch = Sequences { sequences, length, ..Sequences::default() };
+        let mut batch = SequenceBatch { sequences, length, ..SequenceBatch::default() };
         for t in 0..length {
             for start in &starts {
                 let (obs, rest) = row(start + t).split_at(self.observation_size);

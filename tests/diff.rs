@@ -5,8 +5,8 @@ use std::f64::consts::PI;
 use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_forward, linearise};
 use handful::diff::pusher::STATE;
 use handful::diff::{
-    CartPoleSwing, Ilqr, IlqrConfig, IlqrControl, PendulumSwing, PolicySearch, PolicySearchConfig, Pusher, PusherTask,
-    Recording, System,
+    AnalyticPolicyGradient, CartPoleSwing, Ilqr, IlqrConfig, IlqrControl, PendulumSwing, PolicySearchConfig, Pusher,
+    PusherTask, Recording, System,
 };
 use handful::env::cartpole::CartPoleState;
 use handful::env::pendulum::{Pendulum, PendulumState};
@@ -219,7 +219,7 @@ fn ilqr_controls_the_environment_with_a_receding_horizon() {
 #[test]
 fn a_policy_learns_through_the_simulator() {
     let mut rng = rng::stream(5, "diff");
-    let mut search = PolicySearch::new(&PendulumSwing, PolicySearchConfig::default(), &mut rng);
+    let mut search = AnalyticPolicyGradient::new(&PendulumSwing, PolicySearchConfig::default(), &mut rng);
     while search.steps < 200_000 {
         search.update(&PendulumSwing, &mut rng);
     }

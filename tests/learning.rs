@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use handful::agent::dreamer::ActorCriticConfig;
-use handful::agent::{Agent, Mode, Sac, SacConfig, Seat};
+use handful::agent::{Agent, Mode, Sac, SacConfig, Slot};
 use handful::env::{Env, Step, Task, World};
 use handful::error::Error;
 use handful::model::{EnsembleConfig, RssmConfig, WorldModelConfig};
@@ -11,7 +11,7 @@ use handful::plan::{IcemConfig, PlannerConfig};
 use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng;
 use handful::study::config::RunConfig;
-use handful::study::evaluate::{Judge, Starts};
+use handful::study::evaluate::{EvalSeeds, Evaluator};
 use handful::study::run::{Event, Run, is_complete, trained_agent};
 
 /// An episode of learning; its return.
@@ -45,8 +45,8 @@ fn sac_swings_the_pendulum_up() {
     for seed in 0..30 {
         episode(&mut env, &mut agent, seed);
     }
-    let mut judge = Judge::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
-    let summary = judge.evaluate(&mut agent, 20, Starts::Test).expect("valid actions").summary();
+    let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
+    let summary = evaluator.evaluate(&mut agent, 20, EvalSeeds::Test).expect("valid actions").summary();
     assert!(summary.return_mean > -250.0, "mean return {}", summary.return_mean);
 }
 
@@ -64,7 +64,7 @@ fn pets_swings_the_pendulum_up_after_one_random_episode() {
 
     let (mut obs, mut best, mut first) = (env.reset(START), 0.0, true);
     loop {
-        let action = oracle.act_all(&[Seat { number: 0, first, obs: &obs, world: &env }]).remove(0);
+        let action = oracle.act_all(&[Slot { index: 0, first, obs: &obs, world: &env }]).remove(0);
         let outcome = env.step(&action).expect("a valid action");
         best += outcome.reward;
         if outcome.done() {
@@ -83,16 +83,16 @@ fn dreamer_swings_the_pendulum_up() {
     let mut config = RunConfig::new(Task::Pendulum, "dreamer", 0, None, None).expect("a preset");
     let dreamer = config.dreamer.as_mut().expect("Dreamer's settings");
     (dreamer.world.units, dreamer.behaviour.units) = (64, 64);
-    (dreamer.world.rssm.memory, dreamer.world.rssm.hidden, dreamer.world.rssm.categoricals) = (64, 32, 8);
+    (dreamer.world.rssm.deter, dreamer.world.rssm.hidden, dreamer.world.rssm.stoch) = (64, 32, 8);
     let (mut env, mut agent) = (Task::Pendulum.make(), config.agent().expect("an agent"));
     for seed in 0..25 {
         episode(&mut env, agent.as_mut(), seed);
     }
-    let mut judge = Judge::new(|| config.world()).expect("a world");
-    let evaluation = judge.evaluate(agent.as_mut(), 20, Starts::Test).expect("valid actions");
+    let mut evaluator = Evaluator::new(|| config.world()).expect("a world");
+    let evaluation = evaluator.evaluate(agent.as_mut(), 20, EvalSeeds::Test).expect("valid actions");
     let mean = evaluation.summary().return_mean;
     assert!(mean > -400.0, "mean return {mean}");
-    let five_steps = &agent.judge_model(&evaluation.traces)[2];
+    let five_steps = &agent.judge_model(&evaluation.episodes)[2];
     assert!(five_steps.rmse < 0.3, "{five_steps:?}: 1 is as good as foreseeing no change");
 }
 
@@ -100,9 +100,9 @@ fn dreamer_swings_the_pendulum_up() {
 #[test]
 fn the_oracle_swings_the_pendulum_up() {
     let config = RunConfig::new(Task::Pendulum, "oracle", 0, None, None).expect("a preset");
-    let mut judge = Judge::new(|| config.world()).expect("a world");
+    let mut evaluator = Evaluator::new(|| config.world()).expect("a world");
     let mut oracle = config.agent().expect("an oracle");
-    let summary = judge.evaluate(oracle.as_mut(), 6, Starts::Test).expect("valid actions").summary();
+    let summary = evaluator.evaluate(oracle.as_mut(), 6, EvalSeeds::Test).expect("valid actions").summary();
     assert!(summary.return_mean > -200.0, "mean return {}", summary.return_mean);
     assert_eq!(summary.success, 1.0, "upright at the end, always");
 }
@@ -118,8 +118,8 @@ fn the_oracle_does_not_disturb_the_world() {
     let mut oracle = config.agent().expect("an oracle");
     let mut first = true;
     for _ in 0..3 {
-        let seat = Seat { number: 0, first, obs: &obs, world: &world };
-        let action = oracle.act_all(&[seat]).remove(0);
+        let slot = Slot { index: 0, first, obs: &obs, world: &world };
+        let action = oracle.act_all(&[slot]).remove(0);
         let (a, b) = (world.step(&action).expect("valid"), untouched.step(&action).expect("valid"));
         assert_eq!(a.observation, b.observation);
         first = false;
@@ -203,8 +203,7 @@ fn small_dreamer(seed: u64) -> RunConfig {
     let dreamer = config.dreamer.as_mut().expect("Dreamer's settings");
     (dreamer.batch, dreamer.length, dreamer.train_ratio, dreamer.warm_up) = (2, 8, 1.0, 200);
     dreamer.world = WorldModelConfig { units: 16, layers: 1, ..dreamer.world.clone() };
-    dreamer.world.rssm =
-        RssmConfig { memory: 16, blocks: 2, hidden: 8, categoricals: 4, classes: 4, ..RssmConfig::default() };
+    dreamer.world.rssm = RssmConfig { deter: 16, blocks: 2, hidden: 8, stoch: 4, classes: 4, ..RssmConfig::default() };
     dreamer.behaviour = ActorCriticConfig { units: 16, layers: 1, horizon: 5, ..ActorCriticConfig::default() };
     config
 }
@@ -299,8 +298,8 @@ fn a_trained_agent_comes_back_from_its_folder() {
     finish(&mut run);
     let (config, mut agent) = trained_agent(folder.path()).expect("a complete run");
     assert_eq!(config, debug_run(2));
-    let mut judge = Judge::new(|| config.world()).expect("a world");
-    let again = judge.evaluate(agent.as_mut(), config.test_episodes, Starts::Test).expect("valid actions");
+    let mut evaluator = Evaluator::new(|| config.world()).expect("a world");
+    let again = evaluator.evaluate(agent.as_mut(), config.test_episodes, EvalSeeds::Test).expect("valid actions");
     let tested = std::fs::read_to_string(folder.path().join("summary.toml")).expect("a summary");
     let tested: toml::Table = toml::from_str(&tested).expect("TOML");
     assert_eq!(tested["return_mean"].as_float(), Some(again.summary().return_mean));

@@ -1,8 +1,8 @@
 //! What a learned model must be: right where it has seen enough, unsure where it has not, and honest about chance.
 
 use handful::env::{Env, Feature, KnownReward, Spec, Task};
-use handful::model::calibration::{Judged, coverage};
-use handful::model::open_loop::{OpenLoop, Trace, open_loop};
+use handful::model::calibration::{GaussianForecast, coverage};
+use handful::model::open_loop::{Episode, OpenLoop, open_loop};
 use handful::model::{
     Autoencoder, AutoencoderConfig, Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward,
     RssmConfig, WorldModel, WorldModelConfig,
@@ -53,25 +53,25 @@ impl KnownReward for Reach {
     }
 }
 
-fn experience(count: usize, rng: &mut Rng) -> (ReplayBuffer, Vec<Trace>) {
+fn experience(count: usize, rng: &mut Rng) -> (ReplayBuffer, Vec<Episode>) {
     let mut data = ReplayBuffer::new(4, 1, count);
-    let mut traces = Vec::new();
+    let mut episodes = Vec::new();
     while data.len() < count {
         let mut obs = seen(rng::uniform(rng, -1.0, 1.0) as f32, rng::uniform(rng, -1.0, 1.0) as f32);
-        let mut trace = Trace { observations: vec![obs.clone()], ..Trace::default() };
+        let mut episode = Episode { observations: vec![obs.clone()], ..Episode::default() };
         for _ in 0..spec().horizon {
             let action = vec![rng::uniform(rng, -1.0, 1.0) as f32];
             let next_obs = step(&obs, action[0], rng);
             let reward = Reach.reward(&obs, &action, &next_obs);
-            trace.observations.push(next_obs.clone());
-            trace.actions.push(action.clone());
+            episode.observations.push(next_obs.clone());
+            episode.actions.push(action.clone());
             let terminated = false;
             data.push(&Transition { obs, action, reward, next_obs: next_obs.clone(), terminated, truncated: false });
             obs = next_obs;
         }
-        traces.push(trace);
+        episodes.push(episode);
     }
-    (data, traces)
+    (data, episodes)
 }
 
 fn config() -> EnsembleConfig {
@@ -107,7 +107,7 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
             assert!(said.epistemic[0] < said.aleatoric[0], "with so much data, chance is the greater part");
             let total = (said.aleatoric[0] + said.epistemic[0]).sqrt();
             let outcome = f64::from(step(&obs, action, &mut rng)[0]);
-            judged.push(Judged { mean: said.mean[0], deviation: total, outcome });
+            judged.push(GaussianForecast { mean: said.mean[0], deviation: total, outcome });
         }
         let inside = coverage(&judged, 0.9);
         assert!((0.84..0.97).contains(&inside), "{inside} of the outcomes lie in the interval of 90 %");
@@ -117,10 +117,16 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
 /// A step size that falls brings the networks to rest: closer to the law than one that keeps them trembling to the end.
 #[test]
 fn networks_whose_steps_shorten_come_closer_to_the_law() {
-    let error = |anneal: f32| -> f64 {
-        let dynamics =
-            fitted(EnsembleConfig { anneal, held_out: 0.0, members: 1, elites: 1, learning_rate: 1e-2, ..config() })
-                .dynamics();
+    let error = |final_learning_rate_fraction: f32| -> f64 {
+        let dynamics = fitted(EnsembleConfig {
+            final_learning_rate_fraction,
+            held_out: 0.0,
+            members: 1,
+            elites: 1,
+            learning_rate: 1e-2,
+            ..config()
+        })
+        .dynamics();
         let mut rng = rng::stream(2, "test");
         let mut square = || {
             let obs = seen(rng::uniform(&mut rng, -0.8, 0.8) as f32, rng::uniform(&mut rng, -0.8, 0.8) as f32);
@@ -187,17 +193,17 @@ fn a_model_is_judged_over_many_steps() {
 }
 
 /// The same experience for models that read it in order.
-fn moments(traces: &[Trace]) -> SequenceReplay {
+fn moments(episodes: &[Episode]) -> SequenceReplay {
     let mut moments = SequenceReplay::new(4, 1, 100_000);
-    for trace in traces {
-        for (t, action) in trace.actions.iter().enumerate() {
+    for episode in episodes {
+        for (t, action) in episode.actions.iter().enumerate() {
             moments.push(&Transition {
-                obs: trace.observations[t].clone(),
+                obs: episode.observations[t].clone(),
                 action: action.clone(),
-                reward: Reach.reward(&trace.observations[t], action, &trace.observations[t + 1]),
-                next_obs: trace.observations[t + 1].clone(),
+                reward: Reach.reward(&episode.observations[t], action, &episode.observations[t + 1]),
+                next_obs: episode.observations[t + 1].clone(),
                 terminated: false,
-                truncated: t + 1 == trace.actions.len(),
+                truncated: t + 1 == episode.actions.len(),
             });
         }
     }
@@ -207,9 +213,9 @@ fn moments(traces: &[Trace]) -> SequenceReplay {
 #[test]
 fn latent_models_foresee_too() {
     let mut rng = rng::stream(6, "model");
-    let (_, traces) = experience(2000, &mut rng);
+    let (_, episodes) = experience(2000, &mut rng);
     let (_, unseen) = experience(500, &mut rng);
-    let data = moments(&traces);
+    let data = moments(&episodes);
     let better = |name: &str, judged: Vec<OpenLoop>| {
         let five = judged.iter().find(|row| row.horizon == 5).expect("five steps");
         assert!(five.rmse < 0.6, "{name}: better than foreseeing no change: {five:?}");
@@ -223,7 +229,7 @@ fn latent_models_foresee_too() {
     }
     better("autoencoder", open_loop(&autoencoder, &unseen, &mut rng));
 
-    let rssm = RssmConfig { memory: 32, blocks: 2, hidden: 32, categoricals: 8, classes: 8, unimix: 0.01 };
+    let rssm = RssmConfig { deter: 32, blocks: 2, hidden: 32, stoch: 8, classes: 8, unimix: 0.01 };
     let config =
         WorldModelConfig { rssm, units: 32, layers: 2, bins: 41, bin_limit: 5.0, ..WorldModelConfig::default() };
     let mut world = WorldModel::new(&spec(), &config, &mut rng);
@@ -234,19 +240,19 @@ fn latent_models_foresee_too() {
     better("world model", open_loop(&world, &unseen, &mut rng));
 
     // What it says of rewards, with open eyes.
-    let trace = &unseen[0];
+    let episode = &unseen[0];
     let cpu = handful::nn::device();
     let mut belief = world.initial(1);
     let mut wrong = 0.0;
-    for (t, action) in trace.actions.iter().enumerate() {
+    for (t, action) in episode.actions.iter().enumerate() {
         let done = tensor(&cpu, action.clone(), (1, 1, 1));
         if t == 0 {
-            belief = world.observe(&belief, &tensor(&cpu, vec![0.0], (1, 1, 1)), &trace.observations[0], &mut rng);
+            belief = world.observe(&belief, &tensor(&cpu, vec![0.0], (1, 1, 1)), &episode.observations[0], &mut rng);
         }
-        belief = world.observe(&belief, &done, &trace.observations[t + 1], &mut rng);
+        belief = world.observe(&belief, &done, &episode.observations[t + 1], &mut rng);
         let told = world.rewards(&belief.features())[0];
-        let truth = Reach.reward(&trace.observations[t], action, &trace.observations[t + 1]);
-        wrong += (told - truth).abs() / trace.actions.len() as f32;
+        let truth = Reach.reward(&episode.observations[t], action, &episode.observations[t + 1]);
+        wrong += (told - truth).abs() / episode.actions.len() as f32;
     }
     assert!(wrong < 0.15, "rewards between -3 and 0 are told to {wrong}");
     assert!((world.continues(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
@@ -264,15 +270,15 @@ fn gradients_of_imagined_returns_are_exact() {
     let known_reward = Reward::Known(&Reach);
     for (dynamics, reward) in [(&known, known_reward), (&gated, known_reward), (&learned, Reward::Learned)] {
         let model = Differentiable::new(dynamics);
-        for caution in [0.0, 0.5] {
-            let (returns, slopes) = model.gradients(reward, &obs, &actions, 6, caution);
+        for disagreement_penalty in [0.0, 0.5] {
+            let (returns, slopes) = model.gradients(reward, &obs, &actions, 6, disagreement_penalty);
             assert_eq!((returns.len(), slopes.len()), (2, 12));
             let largest = slopes.iter().fold(0.0_f32, |a, s| a.max(s.abs()));
             for i in 0..12 {
                 let at = |by: f32| {
                     let mut moved = actions.clone();
                     moved[i] += by;
-                    f64::from(model.gradients(reward, &obs, &moved, 6, caution).0[i / 6])
+                    f64::from(model.gradients(reward, &obs, &moved, 6, disagreement_penalty).0[i / 6])
                 };
                 let difference = (at(1e-2) - at(-1e-2)) / 2e-2;
                 let error = (f64::from(slopes[i]) - difference).abs() / f64::from(largest);
@@ -288,9 +294,9 @@ fn rewards_can_be_learned() {
     let dynamics = fitted(EnsembleConfig { learn_reward: true, ..config() }).dynamics();
     let actions: Vec<f32> = (0..40).map(|i| (i as f32 * 1.3).sin()).collect();
     let returns = |reward| {
-        let propagation = Propagation::Mean;
+        let propagation = Propagation::Expectation;
         let imagination = Imagination { dynamics: &dynamics, reward, propagation, particles: 5, value: None };
-        imagination.futures(&seen(0.1, 0.0), &actions, 10, &mut rng::stream(3, "luck")).returns
+        imagination.imagined_returns(&seen(0.1, 0.0), &actions, 10, &mut rng::stream(3, "luck")).returns
     };
     let (known, learned) = (returns(Reward::Known(&Reach)), returns(Reward::Learned));
     for (known, learned) in known.iter().zip(&learned) {
@@ -377,7 +383,7 @@ fn a_cube_may_lie_on_any_side() {
         let row = data.row(i);
         // With the first steps the changes are wild, so that a wrong name could not hide.
         let [(as_it_lies, _), (on_its_side, _)] =
-            [row.obs.to_vec(), tipped(row.obs)].map(|obs| dynamics.opinions(&obs, row.action));
+            [row.obs.to_vec(), tipped(row.obs)].map(|obs| dynamics.member_predictions(&obs, row.action));
         for (one, other) in as_it_lies.iter().zip(&on_its_side) {
             let after = |means: &[f64]| {
                 let mut after = row.obs.to_vec();

@@ -4,7 +4,7 @@
 use dfdx::prelude::*;
 use handful::nn::kernels::{self, DenseShape, Matrix};
 use handful::nn::{
-    Activation, Adam, AdamConfig, BlockDense, Init, Learning, Mlp, MlpConfig, Norm, Parameters, SquashedGaussian,
+    Activation, Adam, AdamConfig, BlockDense, Grad, Init, Mlp, MlpConfig, Norm, Parameters, SquashedGaussian,
     SymexpBins, Tensor3, Weights, copy_parameters, device, norm, ops, polyak, recurrent, tensor, values,
 };
 use handful::rng::{self, Rng};
@@ -101,11 +101,11 @@ fn gradients_of_a_dense_layer() {
         check_gradients(inputs, |inputs, taped| {
             let [x, w, b] = inputs else { unreachable!() };
             if taped {
-                let y = ops::dense(x.clone().leaky_traced(), w, b, activation, Learning::Trained);
+                let y = ops::dense(x.clone().leaky_traced(), w, b, activation, Grad::Both);
                 let loss = scalar(y, &weights);
                 (loss.array(), Some(loss.backward()))
             } else {
-                (scalar(ops::dense(x.clone(), w, b, activation, Learning::Trained), &weights).array(), None)
+                (scalar(ops::dense(x.clone(), w, b, activation, Grad::Both), &weights).array(), None)
             }
         });
     }
@@ -146,9 +146,9 @@ fn gradients_of_normalisation() {
             gain,
             shift,
             activation,
-            Learning::Trained
+            Grad::Both
         ));
-        check_operation!(vec![draw(6), draw(1)], |x, [gain]| norm::rms_norm(x, gain, activation, Learning::Trained));
+        check_operation!(vec![draw(6), draw(1)], |x, [gain]| norm::rms_norm(x, gain, activation, Grad::Both));
     }
 }
 
@@ -161,7 +161,7 @@ fn root_mean_square_normalisation_is_the_references() {
         (Activation::Identity, [0.529_805_51, -1.059_611_01, 0.264_902_75, 1.589_416_52]),
         (Activation::Silu, [0.333_479_59, -0.272_726_71, 0.149_892_87, 1.320_064_45]),
     ] {
-        let y = norm::rms_norm(x.clone(), &gain, activation, Learning::Frozen);
+        let y = norm::rms_norm(x.clone(), &gain, activation, Grad::Input);
         values(&y).iter().zip(expected).for_each(|(y, expected)| near("normalised", *y, expected, 1e-6));
     }
 }
@@ -264,7 +264,7 @@ fn gradients_of_joining() {
 fn frozen_parameters_get_no_gradient() {
     let mut rng = rng::stream(4, "frozen");
     let (x, w, b) = (random((1, 7, 5), &mut rng), random((2, 5, 4), &mut rng), random((2, 1, 4), &mut rng));
-    let y = ops::dense(x.clone().leaky_traced(), &w, &b, Activation::Relu, Learning::Frozen);
+    let y = ops::dense(x.clone().leaky_traced(), &w, &b, Activation::Relu, Grad::Input);
     let mut gradients = y.square().sum::<Rank0, _>().backward();
     assert!(gradients.get_or_alloc_mut(&w).expect("memory").iter().all(|g| *g == 0.0));
     assert!(gradients.get_or_alloc_mut(&b).expect("memory").iter().all(|g| *g == 0.0));
@@ -342,14 +342,14 @@ fn network(members: usize, norm: Norm, seed: u64) -> Mlp {
 fn members_do_not_mix() {
     let both = network(2, Norm::Layer, 0);
     let x = random((1, 5, 3), &mut rng::stream(5, "x"));
-    let y = both.forward(x.clone(), Learning::Frozen);
+    let y = both.forward(x.clone(), Grad::Input);
     let mut alone = network(1, Norm::Layer, 1);
     for member in 0..2 {
         for ((_, mine), (_, ours)) in alone.parameters_mut().into_iter().zip(both.parameters()) {
             let size = values(ours).len() / 2;
             mine.copy_from(&values(ours)[member * size..][..size]);
         }
-        let own = alone.forward(x.clone(), Learning::Frozen);
+        let own = alone.forward(x.clone(), Grad::Input);
         assert_eq!(values(&own), &values(&y)[member * 10..][..10]);
     }
 }

@@ -1,8 +1,8 @@
 //! Every planner finds known optima, and none needs to know what it plans for.
 
 use handful::plan::{
-    CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig, Objective, Plan,
-    PlannerConfig, RecedingHorizon, Sequences, ShootingConfig,
+    ActionSequences, CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig,
+    Objective, Plan, PlannerConfig, RecedingHorizon, ShootingConfig,
 };
 use handful::rng;
 
@@ -22,7 +22,8 @@ fn climbers() -> [(&'static str, PlannerConfig); 2] {
 fn climbers_find_the_bottom_of_a_bowl() {
     let target = target();
     for (name, config) in climbers() {
-        let plan = config.build(2).plan(&mut |c: &Sequences| bowl(c, &target), &mut |_| {}, &mut rng::stream(0, name));
+        let plan =
+            config.build(2).plan(&mut |c: &ActionSequences| bowl(c, &target), &mut |_| {}, &mut rng::stream(0, name));
         let distance = farthest(&plan, &target);
         assert!(distance < 0.05, "{name}: {distance} from the optimum");
     }
@@ -33,10 +34,10 @@ fn climbers_find_the_bottom_of_a_bowl() {
 fn the_hybrid_trusts_no_slope_that_does_not_keep_its_word() {
     struct Liar(Vec<f32>);
     impl Objective for Liar {
-        fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+        fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
             bowl(sequences, &self.0)
         }
-        fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+        fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
             (self.returns(sequences), vec![1.0; sequences.values.len()])
         }
     }
@@ -45,19 +46,19 @@ fn the_hybrid_trusts_no_slope_that_does_not_keep_its_word() {
     let mut liar = Liar(target());
     let honest = PlannerConfig::Icem(icem.clone()).build(2).plan(&mut liar, &mut |_| {}, &mut rng::stream(0, name));
     let plan = config.build(2).plan(&mut liar, &mut |_| {}, &mut rng::stream(0, name));
-    assert!(plan.promised >= honest.promised, "{} after {}", plan.promised, honest.promised);
+    assert!(plan.best_return >= honest.best_return, "{} after {}", plan.best_return, honest.best_return);
 }
 
 #[test]
 fn a_receding_horizon_plans_only_when_it_is_time() {
     let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 50 });
-    let mut control = RecedingHorizon::new(&config, 2, &ControlConfig { hold: 2, replan_every: 3 });
+    let mut control = RecedingHorizon::new(&config, 2, &ControlConfig { action_repeat: 2, replan_every: 3 });
     let mut rng = rng::stream(0, "receding");
     let mut plans = 0;
     let target = target();
     let mut before = Vec::new();
     for step in 0..13 {
-        let mut objective = |c: &Sequences| {
+        let mut objective = |c: &ActionSequences| {
             plans += 1;
             assert!(
                 c.horizon == 2 * HORIZON && c.rows().all(|row| row[..2] == row[2..4]),
@@ -73,7 +74,7 @@ fn a_receding_horizon_plans_only_when_it_is_time() {
         before = action;
     }
     control.reset();
-    control.act(&mut |c: &Sequences| bowl(c, &target), &mut |_| plans += 1, &mut rng);
+    control.act(&mut |c: &ActionSequences| bowl(c, &target), &mut |_| plans += 1, &mut rng);
     assert_eq!(plans, 4, "a new episode begins with a new plan");
 }
 
@@ -81,7 +82,8 @@ fn a_receding_horizon_plans_only_when_it_is_time() {
 /// optimum.
 fn planners() -> [(&'static str, PlannerConfig, f32); 3] {
     let cem = CemConfig { horizon: HORIZON, iterations: 10, ..CemConfig::default() };
-    let icem = IcemConfig { horizon: HORIZON, population: 300, iterations: 8, colour: 1.0, ..IcemConfig::default() };
+    let icem =
+        IcemConfig { horizon: HORIZON, population: 300, iterations: 8, noise_beta: 1.0, ..IcemConfig::default() };
     let mppi = MppiConfig {
         horizon: HORIZON,
         population: 2000,
@@ -98,7 +100,7 @@ fn planners() -> [(&'static str, PlannerConfig, f32); 3] {
 }
 
 /// Minus the squared distance from a target within the bounds.
-fn bowl(candidates: &Sequences, target: &[f32]) -> Vec<f32> {
+fn bowl(candidates: &ActionSequences, target: &[f32]) -> Vec<f32> {
     let worth = |row: &[f32]| -row.iter().zip(target).map(|(a, t)| (a - t).powi(2)).sum::<f32>();
     candidates.rows().map(worth).collect()
 }
@@ -124,7 +126,7 @@ fn planners_find_the_bottom_of_a_bowl() {
             assert!(iteration.candidates.values.iter().all(|a| (-1.0..=1.0).contains(a)), "{name}: within bounds");
             iterations += 1;
         };
-        let plan = planner.plan(&mut |candidates: &Sequences| bowl(candidates, &target), &mut watch, &mut rng);
+        let plan = planner.plan(&mut |candidates: &ActionSequences| bowl(candidates, &target), &mut watch, &mut rng);
         assert!(iterations > 0);
         let distance = farthest(&plan, &target);
         assert!(distance < tolerance, "{name}: {distance} from the optimum");
@@ -137,10 +139,11 @@ fn shooting_takes_the_best_of_what_it_tried() {
     let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 300 });
     let mut tried = None;
     let mut watch = |i: &Iteration| tried = Some((i.candidates.clone(), i.returns.to_vec()));
-    let plan = config.build(2).plan(&mut |c: &Sequences| bowl(c, &target), &mut watch, &mut rng::stream(0, "shooting"));
+    let plan =
+        config.build(2).plan(&mut |c: &ActionSequences| bowl(c, &target), &mut watch, &mut rng::stream(0, "shooting"));
     let (candidates, returns) = tried.expect("one iteration");
     assert_eq!(candidates.count(), 300);
-    assert!(returns.iter().all(|r| *r <= plan.promised));
+    assert!(returns.iter().all(|r| *r <= plan.best_return));
     assert!(candidates.rows().any(|row| row == plan.actions));
 }
 
@@ -149,8 +152,8 @@ fn shooting_takes_the_best_of_what_it_tried() {
 fn planners_reach_the_bounds() {
     for (name, config, _) in planners() {
         let mut planner = config.build(2);
-        let sum = |candidates: &Sequences| candidates.rows().map(|row| row.iter().sum()).collect();
-        let plan = planner.plan(&mut |c: &Sequences| sum(c), &mut |_| {}, &mut rng::stream(1, name));
+        let sum = |candidates: &ActionSequences| candidates.rows().map(|row| row.iter().sum()).collect();
+        let plan = planner.plan(&mut |c: &ActionSequences| sum(c), &mut |_| {}, &mut rng::stream(1, name));
         let mean = plan.actions.iter().sum::<f32>() / plan.actions.len() as f32;
         // CEM's spread vanishes on the way to a bound, so it stops short of it.
         assert!(mean > 0.8, "{name}: {mean}");
@@ -180,13 +183,13 @@ fn a_warm_start_helps() {
         let mut rng = rng::stream(2, name);
         let mut distances = Vec::new();
         for _ in 0..6 {
-            let plan = planner.plan(&mut |c: &Sequences| bowl(c, &target), &mut |_| {}, &mut rng);
+            let plan = planner.plan(&mut |c: &ActionSequences| bowl(c, &target), &mut |_| {}, &mut rng);
             distances.push(plan.actions.iter().zip(&target).map(|(a, t)| (a - t).powi(2)).sum::<f32>());
             planner.shift(1);
         }
         assert!(distances[5] < 0.6 * distances[0], "{name}: {distances:?}");
         planner.reset();
-        let anew = planner.plan(&mut |c: &Sequences| bowl(c, &target), &mut |_| {}, &mut rng);
+        let anew = planner.plan(&mut |c: &ActionSequences| bowl(c, &target), &mut |_| {}, &mut rng);
         let distance = anew.actions.iter().zip(&target).map(|(a, t)| (a - t).powi(2)).sum::<f32>();
         assert!(distance > distances[5], "{name}: forgets when it is told to");
     }
@@ -198,11 +201,11 @@ fn not_a_number_is_never_chosen() {
     let all = planners().into_iter().chain([("shooting", shooting, 0.0)]);
     for (name, config, _) in all {
         let mut planner = config.build(2);
-        let half = |candidates: &Sequences| -> Vec<f32> {
+        let half = |candidates: &ActionSequences| -> Vec<f32> {
             candidates.rows().map(|row| if row[0] > 0.0 { f32::NAN } else { row[1] }).collect()
         };
-        let plan = planner.plan(&mut |c: &Sequences| half(c), &mut |_| {}, &mut rng::stream(3, name));
+        let plan = planner.plan(&mut |c: &ActionSequences| half(c), &mut |_| {}, &mut rng::stream(3, name));
         assert!(plan.actions.iter().all(|a| a.is_finite()), "{name}");
-        assert!(plan.actions[0] <= 0.0 && plan.promised.is_finite(), "{name}: {:?}", &plan.actions[..2]);
+        assert!(plan.actions[0] <= 0.0 && plan.best_return.is_finite(), "{name}: {:?}", &plan.actions[..2]);
     }
 }

@@ -17,7 +17,7 @@ use std::collections::BTreeMap;
 
 use crate::env::World;
 use crate::error::Result;
-use crate::model::open_loop::{OpenLoop, Trace};
+use crate::model::open_loop::{Episode, OpenLoop};
 use crate::nn::Weights;
 use crate::replay::Transition;
 
@@ -35,9 +35,9 @@ pub type Losses = BTreeMap<&'static str, f32>;
 
 /// A place from which an agent acts in an evaluation: one of several worlds side by side.
 #[derive(Clone, Copy)]
-pub struct Seat<'a> {
+pub struct Slot<'a> {
     /// Its number; it stays the same through an episode.
-    pub number: usize,
+    pub index: usize,
     /// Whether this is the first step of an episode.
     pub first: bool,
     /// What is observed.
@@ -48,7 +48,7 @@ pub struct Seat<'a> {
 
 /// A future that an agent imagined.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Foreseen {
+pub struct ImaginedTrajectory {
     /// What it expected to observe, from the present on.
     pub observations: Vec<Vec<f32>>,
     /// The return that it expected.
@@ -69,9 +69,9 @@ pub struct Expectation {
 
 impl Expectation {
     /// Of each moment of an episode but the last, from the values of all its moments.
-    pub fn of_episode(values: &[f32], trace: &Trace, discount: f32) -> Vec<Self> {
-        let mut realised = if trace.terminated { 0.0 } else { *values.last().expect("a value for each moment") };
-        let moments = trace.rewards.iter().zip(values).rev();
+    pub fn of_episode(values: &[f32], episode: &Episode, discount: f32) -> Vec<Self> {
+        let mut realised = if episode.terminated { 0.0 } else { *values.last().expect("a value for each moment") };
+        let moments = episode.rewards.iter().zip(values).rev();
         let mut all: Vec<Self> = moments
             .map(|(reward, expected)| {
                 realised = reward + discount * realised;
@@ -89,15 +89,15 @@ pub trait Agent: Send {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32>;
 
     /// Actions in many worlds at once, in [`Mode::Evaluate`]. Networks answer for all of them in one
-    /// pass; agents with a memory keep one for each seat.
-    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
-        seats.iter().map(|seat| self.act(seat.obs, Mode::Evaluate)).collect()
+    /// pass; agents with a memory keep one for each slot.
+    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        slots.iter().map(|slot| self.act(slot.obs, Mode::Evaluate)).collect()
     }
 
-    /// Acts from one seat as [`Agent::act_all`] does, and shows some of the futures that were weighed up for it: nothing
+    /// Acts from one slot as [`Agent::act_all`] does, and shows some of the futures that were weighed up for it: nothing
     /// for agents that do not plan in a model.
-    fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
-        (self.act_all(&[*seat]).remove(0), Vec::new())
+    fn act_and_show(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        (self.act_all(&[*slot]).remove(0), Vec::new())
     }
 
     /// Takes in one step of experience.
@@ -107,12 +107,12 @@ pub trait Agent: Send {
     fn update(&mut self) -> Option<Losses>;
 
     /// How well its model foresees episodes that it has not learned from; nothing for agents without a model.
-    fn judge_model(&self, _traces: &[Trace]) -> Vec<OpenLoop> {
+    fn judge_model(&self, _traces: &[Episode]) -> Vec<OpenLoop> {
         Vec::new()
     }
 
     /// What it expects of each moment of episodes, beside what came; nothing for agents that expect nothing.
-    fn judge_values(&self, _traces: &[Trace]) -> Vec<Expectation> {
+    fn judge_values(&self, _traces: &[Episode]) -> Vec<Expectation> {
         Vec::new()
     }
 

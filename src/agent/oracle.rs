@@ -10,11 +10,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::baselines::never_learns;
-use super::{Agent, Mode, Seat};
+use super::{Agent, Mode, Slot};
 use crate::env::tabletop::TableOptions;
 use crate::env::{Env, Snapshot, Task, World, WorldState};
 use crate::error::Result;
-use crate::plan::{ControlConfig, IcemConfig, PlannerConfig, RecedingHorizon, Sequences};
+use crate::plan::{ActionSequences, ControlConfig, IcemConfig, PlannerConfig, RecedingHorizon};
 use crate::rng::{self, Rng};
 
 /// Settings of [`Oracle`].
@@ -26,16 +26,20 @@ pub struct OracleConfig {
     /// How plans become control.
     pub control: ControlConfig,
     /// Steps that the last state of a plan is taken to last: its reward counts so many times more.
-    pub tail: f32,
+    pub terminal_weight: f32,
 }
 
 impl Default for OracleConfig {
     fn default() -> Self {
-        Self { planner: PlannerConfig::Icem(IcemConfig::default()), control: ControlConfig::default(), tail: 0.0 }
+        Self {
+            planner: PlannerConfig::Icem(IcemConfig::default()),
+            control: ControlConfig::default(),
+            terminal_weight: 0.0,
+        }
     }
 }
 
-/// A controller for each seat, and worlds to try things out in.
+/// A controller for each slot, and worlds to try things out in.
 pub struct Oracle {
     config: OracleConfig,
     actions: usize,
@@ -57,21 +61,21 @@ impl Oracle {
         Ok(Self { config, actions, controllers: BTreeMap::new(), worlds, rng: rng::stream(seed, "oracle") })
     }
 
-    fn plan(&mut self, seat: &Seat) -> Vec<f32> {
+    fn plan(&mut self, slot: &Slot) -> Vec<f32> {
         let Self { config, actions, controllers, worlds, rng } = self;
         let new = || RecedingHorizon::new(&config.planner, *actions, &config.control);
-        let controller = controllers.entry(seat.number).or_insert_with(new);
-        if seat.first {
+        let controller = controllers.entry(slot.index).or_insert_with(new);
+        if slot.first {
             controller.reset();
         }
-        let state = seat.world.snapshot();
-        let mut objective = |candidates: &Sequences| returns(worlds, &state, candidates, config.tail);
+        let state = slot.world.snapshot();
+        let mut objective = |candidates: &ActionSequences| returns(worlds, &state, candidates, config.terminal_weight);
         controller.act(&mut objective, &mut |_| {}, rng)
     }
 }
 
 /// The return of each sequence, tried out from `state`, the work shared out over the worlds.
-fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences, tail: f32) -> Vec<f32> {
+fn returns(worlds: &mut [World], state: &WorldState, candidates: &ActionSequences, terminal_weight: f32) -> Vec<f32> {
     let share = candidates.count().div_ceil(worlds.len());
     let mut returns = vec![0.0; candidates.count()];
     let shares = returns.par_chunks_mut(share).zip(worlds).enumerate();
@@ -91,7 +95,7 @@ fn returns(worlds: &mut [World], state: &WorldState, candidates: &Sequences, tai
                     break;
                 }
             }
-            *total += tail * last;
+            *total += terminal_weight * last;
         }
     });
     returns
@@ -104,8 +108,8 @@ impl Agent for Oracle {
         panic!("an oracle acts from a seat in a world, not on an observation")
     }
 
-    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
-        seats.iter().map(|seat| self.plan(seat)).collect()
+    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        slots.iter().map(|slot| self.plan(slot)).collect()
     }
 
     never_learns!(rng);

@@ -8,17 +8,17 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::warm_up::RandomActions;
-use super::{Agent, Foreseen, Losses, Mode, Seat};
+use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot};
 use crate::env::{KnownReward, Spec};
 use crate::error::{Error, Result};
-use crate::model::open_loop::{OpenLoop, Trace, open_loop};
+use crate::model::open_loop::{Episode, OpenLoop, open_loop};
 use crate::model::uncertainty::Risk;
 use crate::model::{
-    Differentiable, Dynamics, Ensemble, EnsembleConfig, Futures, Imagination, Propagation, Reward, Value,
+    Differentiable, Dynamics, Ensemble, EnsembleConfig, Imagination, ImaginedReturns, Propagation, Reward, Value,
 };
 use crate::nn::Weights;
 use crate::plan::{
-    ControlConfig, IcemConfig, Iteration, Objective, Observer, PlannerConfig, RecedingHorizon, Sequences,
+    ActionSequences, ControlConfig, IcemConfig, Iteration, Objective, PlanObserver, PlannerConfig, RecedingHorizon,
 };
 use crate::replay::{ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
@@ -38,21 +38,21 @@ pub struct PetsConfig {
     pub control: ControlConfig,
     /// Steps that the last state of a plan is taken to last: its reward counts so many times more. Lets a short plan
     /// prefer to end well.
-    pub tail: f32,
+    pub terminal_weight: f32,
     /// How uncertainty is carried along imagined futures.
     pub propagation: Propagation,
-    /// Imagined futures of each candidate: a multiple of the ensemble's elites.
+    /// EnsembleObjective futures of each candidate: a multiple of the ensemble's elites.
     pub particles: usize,
     /// What to make of different futures.
     pub risk: Risk,
     /// Return given up for each unit of disagreement between the members.
-    pub caution: f32,
+    pub disagreement_penalty: f32,
     /// Return that a unit of disagreement is worth while exploring.
-    pub curiosity: f32,
+    pub disagreement_bonus: f32,
     /// Random steps before the first plan.
     pub warm_up: usize,
     /// Exponent of the noise of which random actions are made: 0 is white, and barely moves an arm.
-    pub warm_up_colour: f64,
+    pub warm_up_noise_beta: f64,
     /// Steps between two fits of the model.
     pub fit_every: usize,
     /// Transitions remembered.
@@ -65,14 +65,14 @@ impl Default for PetsConfig {
             ensemble: EnsembleConfig::default(),
             planner: PlannerConfig::Icem(IcemConfig::default()),
             control: ControlConfig::default(),
-            tail: 0.0,
+            terminal_weight: 0.0,
             propagation: Propagation::TsInf,
             particles: 5,
             risk: Risk::Neutral,
-            caution: 0.0,
-            curiosity: 0.0,
+            disagreement_penalty: 0.0,
+            disagreement_bonus: 0.0,
             warm_up: 500,
-            warm_up_colour: 2.0,
+            warm_up_noise_beta: 2.0,
             fit_every: 200,
             replay: 1_000_000,
         }
@@ -107,14 +107,14 @@ pub struct Pets {
     observed: usize,
     random: RandomActions,
     /// Plans where it learns.
-    pilot: Pilot,
-    /// Plan where it is judged, one for each seat.
-    seats: Vec<Pilot>,
+    controller: Controller,
+    /// Plan where it is judged, one for each slot.
+    slots: Vec<Controller>,
     rng: Rng,
 }
 
 /// A controller in one world, with its own random numbers.
-struct Pilot {
+struct Controller {
     control: RecedingHorizon,
     rng: Rng,
 }
@@ -133,9 +133,9 @@ impl Pets {
             dynamics: None,
             replay: ReplayBuffer::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
-            random: RandomActions::new(config.warm_up_colour, spec.horizon, spec.action_size),
-            pilot: Pilot::new(&config, spec, rng::stream(seed, "pets planner")),
-            seats: Vec::new(),
+            random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
+            controller: Controller::new(&config, spec, rng::stream(seed, "pets planner")),
+            slots: Vec::new(),
             spec: spec.clone(),
             reward,
             rng,
@@ -148,17 +148,17 @@ impl Pets {
         self.dynamics.as_ref()
     }
 
-    /// Makes sure that there is a pilot for each seat, and a fresh one for an episode that begins: then the same
+    /// Makes sure that there is a controller for each slot, and a fresh one for an episode that begins: then the same
     /// weights act alike in the same episode, whatever was judged before.
-    fn prepare(&mut self, seats: &[Seat]) {
-        let Self { seats: pilots, config, spec, .. } = self;
-        let fresh = |number: usize| Pilot::new(config, spec, rng::stream(number as u64, "pets seat"));
-        for seat in seats {
-            while pilots.len() <= seat.number {
-                pilots.push(fresh(pilots.len()));
+    fn prepare(&mut self, slots: &[Slot]) {
+        let Self { slots: controllers, config, spec, .. } = self;
+        let fresh = |number: usize| Controller::new(config, spec, rng::stream(number as u64, "pets seat"));
+        for slot in slots {
+            while controllers.len() <= slot.index {
+                controllers.push(fresh(controllers.len()));
             }
-            if seat.first {
-                pilots[seat.number] = fresh(seat.number);
+            if slot.first {
+                controllers[slot.index] = fresh(slot.index);
             }
         }
     }
@@ -178,7 +178,7 @@ impl Pets {
 }
 
 /// What action sequences are worth in imagination.
-struct Imagined<'a> {
+struct EnsembleObjective<'a> {
     imagination: Imagination<'a>,
     obs: &'a [f32],
     risk: Risk,
@@ -189,33 +189,39 @@ struct Imagined<'a> {
     differentiable: Option<Differentiable>,
 }
 
-impl Objective for Imagined<'_> {
-    fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
-        let Futures { particles, returns, disagreement } =
-            self.imagination.futures(self.obs, &sequences.values, sequences.horizon, &mut self.rng);
+impl Objective for EnsembleObjective<'_> {
+    fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
+        let ImaginedReturns { particles, returns, disagreement } =
+            self.imagination.imagined_returns(self.obs, &sequences.values, sequences.horizon, &mut self.rng);
         let scores = returns.chunks_exact(particles).zip(disagreement);
         scores.map(|(returns, apart)| self.risk.of(returns) + self.disagreement * apart).collect()
     }
 
-    fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+    fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         let Imagination { dynamics, reward, .. } = self.imagination;
         let model = self.differentiable.get_or_insert_with(|| Differentiable::new(dynamics));
-        let caution = if let Risk::Deviation(weight) = self.risk { weight } else { -self.disagreement };
-        model.gradients(reward, self.obs, &sequences.values, sequences.horizon, caution)
+        let disagreement_penalty = if let Risk::Deviation(weight) = self.risk { weight } else { -self.disagreement };
+        model.gradients(reward, self.obs, &sequences.values, sequences.horizon, disagreement_penalty)
     }
 }
 
-impl Pilot {
+impl Controller {
     fn new(config: &PetsConfig, spec: &Spec, rng: Rng) -> Self {
         Self { control: RecedingHorizon::new(&config.planner, spec.action_size, &config.control), rng }
     }
 
-    fn act(&mut self, foresight: &Foresight, obs: &[f32], curiosity: f32, observer: &mut Observer) -> Vec<f32> {
-        let mut objective = Imagined {
-            imagination: foresight.imagination(),
+    fn act(
+        &mut self,
+        model: &PlanningModel,
+        obs: &[f32],
+        disagreement_bonus: f32,
+        observer: &mut PlanObserver,
+    ) -> Vec<f32> {
+        let mut objective = EnsembleObjective {
+            imagination: model.imagination(),
             obs,
-            risk: foresight.config.risk,
-            disagreement: curiosity - foresight.config.caution,
+            risk: model.config.risk,
+            disagreement: disagreement_bonus - model.config.disagreement_penalty,
             rng: rng::fork(&mut self.rng),
             differentiable: None,
         };
@@ -224,7 +230,7 @@ impl Pilot {
 }
 
 /// All that planning needs of an agent.
-struct Foresight<'a> {
+struct PlanningModel<'a> {
     config: &'a PetsConfig,
     dynamics: &'a Dynamics,
     reward: &'a (dyn KnownReward + Send + Sync),
@@ -232,11 +238,11 @@ struct Foresight<'a> {
     tail: Option<Box<Value<'a>>>,
 }
 
-impl<'a> Foresight<'a> {
+impl<'a> PlanningModel<'a> {
     fn new(config: &'a PetsConfig, dynamics: &'a Dynamics, reward: &'a (dyn KnownReward + Send + Sync)) -> Self {
         let rest = vec![0.0; dynamics.action_size()];
-        let lasting = move |state: &[f32]| config.tail * reward.reward(state, &rest, state);
-        let tail = (config.tail > 0.0 && !config.ensemble.learn_reward).then(|| Box::new(lasting) as Box<_>);
+        let lasting = move |state: &[f32]| config.terminal_weight * reward.reward(state, &rest, state);
+        let tail = (config.terminal_weight > 0.0 && !config.ensemble.learn_reward).then(|| Box::new(lasting) as Box<_>);
         Self { config, dynamics, reward, tail }
     }
 
@@ -251,10 +257,10 @@ impl<'a> Foresight<'a> {
     }
 
     /// What the agent thinks of some action sequences from `obs`, one future each; of the first also each particle's.
-    fn foresee(&self, obs: &[f32], tried: &Sequences) -> Vec<Foreseen> {
+    fn imagine_trajectories(&self, obs: &[f32], tried: &ActionSequences) -> Vec<ImaginedTrajectory> {
         let imagination = self.imagination();
         let (states, futures) =
-            imagination.paths(obs, &tried.values, tried.horizon, &mut rng::stream(0, "pets foresight"));
+            imagination.trajectories(obs, &tried.values, tried.horizon, &mut rng::stream(0, "pets foresight"));
         let (width, count, particles) = (obs.len(), tried.count(), futures.particles);
         let at = |t: usize, p: usize, c: usize| &states[t][(p * count + c) * width..][..width];
         let mean = |t: usize, c: usize| -> Vec<f32> {
@@ -262,12 +268,12 @@ impl<'a> Foresight<'a> {
             (0..width).map(|i| sum(i) / particles as f32).collect()
         };
         let returns = |c: usize| &futures.returns[c * particles..][..particles];
-        let expected = (0..count).map(|c| Foreseen {
+        let expected = (0..count).map(|c| ImaginedTrajectory {
             observations: (0..=tried.horizon).map(|t| mean(t, c)).collect(),
             value: Risk::Neutral.of(returns(c)),
             disagreement: futures.disagreement[c],
         });
-        let possible = (0..particles).map(|p| Foreseen {
+        let possible = (0..particles).map(|p| ImaginedTrajectory {
             observations: (0..=tried.horizon).map(|t| at(t, p, 0).to_vec()).collect(),
             value: returns(0)[p],
             disagreement: futures.disagreement[0],
@@ -279,47 +285,47 @@ impl<'a> Foresight<'a> {
 impl Agent for Pets {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         let Some(dynamics) = &self.dynamics else { return self.random.next(&mut self.rng) };
-        let foresight = Foresight::new(&self.config, dynamics, self.reward.as_ref());
-        let curiosity = if mode == Mode::Explore { self.config.curiosity } else { 0.0 };
-        self.pilot.act(&foresight, obs, curiosity, &mut |_| {})
+        let model = PlanningModel::new(&self.config, dynamics, self.reward.as_ref());
+        let disagreement_bonus = if mode == Mode::Explore { self.config.disagreement_bonus } else { 0.0 };
+        self.controller.act(&model, obs, disagreement_bonus, &mut |_| {})
     }
 
-    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
-        self.prepare(seats);
-        let Some(dynamics) = &self.dynamics else { return vec![vec![0.0; self.spec.action_size]; seats.len()] };
-        let foresight = Foresight::new(&self.config, dynamics, self.reward.as_ref());
-        let mut pilots: Vec<Option<&mut Pilot>> = self.seats.iter_mut().map(Some).collect();
-        let busy: Vec<(&Seat, &mut Pilot)> = seats
+    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        self.prepare(slots);
+        let Some(dynamics) = &self.dynamics else { return vec![vec![0.0; self.spec.action_size]; slots.len()] };
+        let model = PlanningModel::new(&self.config, dynamics, self.reward.as_ref());
+        let mut controllers: Vec<Option<&mut Controller>> = self.slots.iter_mut().map(Some).collect();
+        let busy: Vec<(&Slot, &mut Controller)> = slots
             .iter()
-            .map(|seat| (seat, pilots[seat.number].take().expect("seats have different numbers")))
+            .map(|slot| (slot, controllers[slot.index].take().expect("seats have different numbers")))
             .collect();
-        busy.into_par_iter().map(|(seat, pilot)| pilot.act(&foresight, seat.obs, 0.0, &mut |_| {})).collect()
+        busy.into_par_iter().map(|(slot, controller)| controller.act(&model, slot.obs, 0.0, &mut |_| {})).collect()
     }
 
-    fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
-        self.prepare(&[*seat]);
+    fn act_and_show(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        self.prepare(&[*slot]);
         let Some(dynamics) = &self.dynamics else { return (vec![0.0; self.spec.action_size], Vec::new()) };
-        let foresight = Foresight::new(&self.config, dynamics, self.reward.as_ref());
+        let model = PlanningModel::new(&self.config, dynamics, self.reward.as_ref());
         // The plan, and of each iteration a few that were tried, from the best to the worst.
-        let mut shown: Option<Sequences> = None;
+        let mut shown: Option<ActionSequences> = None;
         let mut observer = |iteration: &Iteration| {
             let tried = iteration.candidates;
             let mut order: Vec<usize> = (0..tried.count()).collect();
             order.sort_by(|a, b| iteration.returns[*b].total_cmp(&iteration.returns[*a]));
             let some = order.iter().step_by((tried.count() / SHOWN).max(1)).flat_map(|&i| tried.row(i));
-            let shown = shown.get_or_insert_with(|| Sequences::new(tried.horizon, tried.actions));
+            let shown = shown.get_or_insert_with(|| ActionSequences::new(tried.horizon, tried.actions));
             // The newest, and so the best, come first.
             shown.values.splice(0..0, some.copied());
         };
-        let action = self.seats[seat.number].act(&foresight, seat.obs, 0.0, &mut observer);
-        (action, shown.map(|shown| foresight.foresee(seat.obs, &shown)).unwrap_or_default())
+        let action = self.slots[slot.index].act(&model, slot.obs, 0.0, &mut observer);
+        (action, shown.map(|shown| model.imagine_trajectories(slot.obs, &shown)).unwrap_or_default())
     }
 
     fn observe(&mut self, transition: &Transition) {
         self.replay.push(transition);
         self.observed += 1;
         if transition.terminated || transition.truncated {
-            self.pilot.control.reset();
+            self.controller.control.reset();
             self.random.reset();
         }
     }
@@ -329,8 +335,8 @@ impl Agent for Pets {
         since.is_multiple_of(self.config.fit_every).then(|| self.fit())
     }
 
-    fn judge_model(&self, traces: &[Trace]) -> Vec<OpenLoop> {
-        let judge = |dynamics| open_loop(dynamics, traces, &mut rng::stream(0, "open loop"));
+    fn judge_model(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
+        let judge = |dynamics| open_loop(dynamics, episodes, &mut rng::stream(0, "open loop"));
         self.dynamics.as_ref().map(judge).unwrap_or_default()
     }
 
@@ -350,7 +356,7 @@ impl Agent for Pets {
         self.replay.save(&mut state, "replay");
         state.insert_counts("counts", &[self.observed as u64]);
         state.insert_counts("rng", &rng::state(&self.rng));
-        state.insert_counts("planner rng", &rng::state(&self.pilot.rng));
+        state.insert_counts("planner rng", &rng::state(&self.controller.rng));
         state
     }
 
@@ -361,7 +367,7 @@ impl Agent for Pets {
         self.replay.load(state, "replay")?;
         self.observed = counts[0] as usize;
         self.rng = rng::from_state(&own);
-        self.pilot = Pilot::new(&self.config, &self.spec, rng::from_state(&planner));
+        self.controller = Controller::new(&self.config, &self.spec, rng::from_state(&planner));
         self.random.reset();
         Ok(())
     }

@@ -9,16 +9,16 @@
 //! by the environment's own [`crate::env::Feature`]s.
 
 use dfdx::prelude::*;
-use dfdx::tensor::{Cpu, Trace as _};
+use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use super::{Agent, Expectation, Losses, Mode, Seat};
+use super::{Agent, Expectation, Losses, Mode, Slot};
 use crate::env::Spec;
 use crate::error::{Error, Result};
-use crate::model::open_loop::Trace;
+use crate::model::open_loop::Episode;
 use crate::nn::ops;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, Weights,
+    Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, Weights,
     copy_parameters, device, polyak, tensor, values,
 };
 use crate::replay::{Batch, ReplayBuffer, Transition};
@@ -176,9 +176,9 @@ impl Sac {
     /// What the critics should say of a batch.
     fn targets(&mut self, batch: &Batch) -> Vec<f32> {
         let next = self.observations(&batch.next_obs);
-        let head = self.policy.forward(next.clone(), Learning::Frozen);
+        let head = self.policy.forward(next.clone(), Grad::Input);
         let (action, log_density) = SquashedGaussian::from_head(head).sample(self.noise(batch.size));
-        let q = self.targets.forward(ops::join(next, action), Learning::Frozen);
+        let q = self.targets.forward(ops::join(next, action), Grad::Input);
         let q = q.min::<(usize, usize), Axis<0>>().as_vec();
         soft_targets(batch, &q, &log_density.as_vec(), self.temperature(), self.config.discount)
     }
@@ -189,7 +189,7 @@ impl Sac {
         let targets = tensor(&self.cpu, targets, (critics, batch.size, 1));
         let actions = tensor(&self.cpu, batch.actions.clone(), (1, batch.size, self.actions));
         let input = ops::join(self.observations(&batch.obs), actions);
-        let q = self.critics.forward(input.leaky_traced(), Learning::FromData);
+        let q = self.critics.forward(input.leaky_traced(), Grad::Params);
         let mean_q = values(&q).iter().sum::<f32>() / (critics * batch.size) as f32;
         // The mean over the batch, summed over the critics.
         let loss = (q - targets).square().mean() * critics as f32;
@@ -203,12 +203,12 @@ impl Sac {
     fn update_policy(&mut self, batch: &Batch) -> Losses {
         let obs = self.observations(&batch.obs);
         let noise = self.noise(batch.size);
-        let head = self.policy.forward(obs.clone().leaky_traced(), Learning::FromData);
+        let head = self.policy.forward(obs.clone().leaky_traced(), Grad::Params);
         let (action, log_density) = SquashedGaussian::from_head(head).sample(noise);
         let log_densities = log_density.as_vec();
         // The critics judge; they do not learn from it.
         let (action, tape) = action.split_tape();
-        let q = self.critics.forward(ops::join(obs.put_tape(tape), action), Learning::Frozen);
+        let q = self.critics.forward(ops::join(obs.put_tape(tape), action), Grad::Input);
         let q = q.min::<(usize, usize), Axis<0>>().mean();
         let loss = log_density.mean() * self.temperature() - q;
         let policy_loss = loss.array();
@@ -227,7 +227,7 @@ impl Sac {
 
     /// The policy's best action for each row of observations.
     fn modes(&self, observations: &[f32]) -> Vec<Vec<f32>> {
-        let head = self.policy.forward(self.observations(observations), Learning::Frozen);
+        let head = self.policy.forward(self.observations(observations), Grad::Input);
         let actions = SquashedGaussian::from_head(head).mode();
         values(&actions).chunks(self.actions).map(<[f32]>::to_vec).collect()
     }
@@ -259,14 +259,14 @@ impl Agent for Sac {
         if self.observed < self.config.warm_up {
             return (0..self.actions).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect();
         }
-        let head = self.policy.forward(self.observations(obs), Learning::Frozen);
+        let head = self.policy.forward(self.observations(obs), Grad::Input);
         let noise = self.noise(1);
         let (action, _) = SquashedGaussian::from_head(head).sample(noise);
         values(&action).to_vec()
     }
 
-    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
-        let observations: Vec<&[f32]> = seats.iter().map(|seat| seat.obs).collect();
+    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
         self.modes(&observations.concat())
     }
 
@@ -283,16 +283,16 @@ impl Agent for Sac {
         rayon::scope(|_| (0..self.config.updates_per_step).map(|_| self.learn()).last())
     }
 
-    fn judge_values(&self, traces: &[Trace]) -> Vec<Expectation> {
-        let of_episode = |trace: &Trace| {
-            let observations = trace.observations.concat();
+    fn judge_values(&self, episodes: &[Episode]) -> Vec<Expectation> {
+        let of_episode = |episode: &Episode| {
+            let observations = episode.observations.concat();
             let actions = self.modes(&observations).concat();
-            let actions = tensor(&self.cpu, actions, (1, trace.observations.len(), self.actions));
-            let q = self.critics.forward(ops::join(self.observations(&observations), actions), Learning::Frozen);
+            let actions = tensor(&self.cpu, actions, (1, episode.observations.len(), self.actions));
+            let q = self.critics.forward(ops::join(self.observations(&observations), actions), Grad::Input);
             let values = q.min::<(usize, usize), Axis<0>>().as_vec();
-            Expectation::of_episode(&values, trace, self.config.discount)
+            Expectation::of_episode(&values, episode, self.config.discount)
         };
-        traces.iter().flat_map(of_episode).collect()
+        episodes.iter().flat_map(of_episode).collect()
     }
 
     fn weights(&self) -> Weights {
@@ -363,10 +363,10 @@ impl Temperature {
         Self { log: start.ln(), rate, moments: [0.0; 2], steps: 0 }
     }
 
-    /// A step on the loss -log(alpha) * surplus, whose gradient is -surplus, where
-    /// surplus = mean(log pi) + target entropy: too little entropy raises the temperature.
-    fn step(&mut self, surplus: f32) {
-        let gradient = -surplus;
+    /// A step on the loss -log(alpha) * entropy_gap, whose gradient is -entropy_gap, where
+    /// entropy_gap = mean(log pi) + target entropy: too little entropy raises the temperature.
+    fn step(&mut self, entropy_gap: f32) {
+        let gradient = -entropy_gap;
         self.steps += 1;
         self.moments[0] += 0.1 * (gradient - self.moments[0]);
         self.moments[1] += 0.001 * (gradient * gradient - self.moments[1]);

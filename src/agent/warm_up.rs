@@ -14,8 +14,8 @@ pub(super) struct RandomActions {
 
 impl RandomActions {
     /// For episodes of so many steps.
-    pub(super) fn new(colour: f64, horizon: usize, size: usize) -> Self {
-        Self { noise: ColoredNoise::new(colour, horizon.max(2)), size, ahead: Vec::new() }
+    pub(super) fn new(noise_beta: f64, horizon: usize, size: usize) -> Self {
+        Self { noise: ColoredNoise::new(noise_beta, horizon.max(2)), size, ahead: Vec::new() }
     }
 
     /// A new episode begins.

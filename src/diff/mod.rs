@@ -2,7 +2,7 @@
 //! derivatives through them, exactly.
 //!
 //! A [`System`] is such a simulator with a cost to be kept low. [`derivatives`] has the Jacobians of a step and the gradients of
-//! whole roll-outs, forwards and backwards; [`Ilqr`] finds good actions with them, [`PolicySearch`] good policies, and
+//! whole roll-outs, forwards and backwards; [`Ilqr`] finds good actions with them, [`AnalyticPolicyGradient`] good policies, and
 //! [`Recording::identify`] the world's own parameters.
 
 pub mod derivatives;
@@ -16,7 +16,7 @@ use nalgebra::{RealField, SVector};
 
 pub use identify::{Identified, Recording};
 pub use ilqr::{Ilqr, IlqrConfig, IlqrControl, Solution};
-pub use policy::{Habitat, PolicySearch, PolicySearchConfig};
+pub use policy::{AnalyticPolicyGradient, PolicyEnv, PolicySearchConfig};
 pub use pusher::{Pusher, PusherTask};
 pub use swing::{CartPoleSwing, PendulumSwing};
 

@@ -12,11 +12,11 @@ use serde::{Deserialize, Serialize};
 
 use super::System;
 use crate::nn::ops::{join, map_rows, record, total};
-use crate::nn::{Activation, Adam, AdamConfig, Init, Learning, Mlp, MlpConfig, Norm, Tensor3, device, tensor, values};
+use crate::nn::{Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, Tensor3, device, tensor, values};
 use crate::rng::Rng;
 
 /// A [`System`] that a policy can live in.
-pub trait Habitat<const N: usize, const M: usize, const O: usize>: System<N, M> {
+pub trait PolicyEnv<const N: usize, const M: usize, const O: usize>: System<N, M> {
     /// What a policy sees of a state: numbers of size one.
     fn observe<S: nalgebra::RealField + Copy>(&self, state: &SVector<S, N>) -> SVector<S, O>;
 
@@ -24,7 +24,7 @@ pub trait Habitat<const N: usize, const M: usize, const O: usize>: System<N, M> 
     fn start(&self, rng: &mut Rng) -> SVector<f64, N>;
 }
 
-/// Settings of a [`PolicySearch`].
+/// Settings of a [`AnalyticPolicyGradient`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PolicySearchConfig {
@@ -50,7 +50,7 @@ impl Default for PolicySearchConfig {
 }
 
 /// A policy and the worlds that it learns in.
-pub struct PolicySearch<const N: usize, const M: usize, const O: usize> {
+pub struct AnalyticPolicyGradient<const N: usize, const M: usize, const O: usize> {
     config: PolicySearchConfig,
     policy: Mlp,
     optimiser: Adam,
@@ -60,9 +60,9 @@ pub struct PolicySearch<const N: usize, const M: usize, const O: usize> {
     pub steps: usize,
 }
 
-impl<const N: usize, const M: usize, const O: usize> PolicySearch<N, M, O> {
+impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M, O> {
     /// A policy that does next to nothing yet.
-    pub fn new(system: &impl Habitat<N, M, O>, config: PolicySearchConfig, rng: &mut Rng) -> Self {
+    pub fn new(system: &impl PolicyEnv<N, M, O>, config: PolicySearchConfig, rng: &mut Rng) -> Self {
         let shape = MlpConfig {
             members: 1,
             input: O,
@@ -87,11 +87,11 @@ impl<const N: usize, const M: usize, const O: usize> PolicySearch<N, M, O> {
     /// What the policy does.
     pub fn act(&self, observation: &SVector<f32, O>) -> SVector<f32, M> {
         let seen = tensor(&device(), observation.as_slice().to_vec(), (1, 1, O));
-        SVector::from_column_slice(values(&self.policy.forward(seen, Learning::Frozen).tanh()))
+        SVector::from_column_slice(values(&self.policy.forward(seen, Grad::Input).tanh()))
     }
 
     /// One gradient step. Returns what a step has cost on average.
-    pub fn update(&mut self, system: &impl Habitat<N, M, O>, rng: &mut Rng) -> f32 {
+    pub fn update(&mut self, system: &impl PolicyEnv<N, M, O>, rng: &mut Rng) -> f32 {
         let PolicySearchConfig { window, episode, .. } = self.config;
         for (state, age) in self.worlds.iter_mut().filter(|(_, age)| *age >= episode) {
             (*state, *age) = (system.start(rng), 0);
@@ -102,7 +102,7 @@ impl<const N: usize, const M: usize, const O: usize> PolicySearch<N, M, O> {
         for _ in 0..window {
             let observe = |x: &[Dual64]| system.observe(&part(x)).as_slice().to_vec();
             let seen = record(&mut tape, &state, |state| simulated(state, O, observe));
-            let action = record(&mut tape, &seen, |seen| self.policy.forward(seen, Learning::Trained).tanh());
+            let action = record(&mut tape, &seen, |seen| self.policy.forward(seen, Grad::Both).tanh());
             let both = record(&mut tape, &state, |state| join(state, action));
             let cost = |x: &[Dual64]| vec![system.cost(&part(&x[..N]), &part(&x[N..]))];
             costs.push((1.0 / window as f32, record(&mut tape, &both, |both| simulated(both, 1, cost))));

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use nalgebra::{RealField, SVector};
 
-use super::{Habitat, System};
+use super::{PolicyEnv, System};
 use crate::env::{cartpole, pendulum};
 use crate::rng::{Rng, uniform};
 
@@ -32,7 +32,7 @@ impl System<2, 1> for PendulumSwing {
 }
 
 /// Sees what the environment shows, and starts as it does.
-impl Habitat<2, 1, 3> for PendulumSwing {
+impl PolicyEnv<2, 1, 3> for PendulumSwing {
     fn observe<S: RealField + Copy>(&self, state: &SVector<S, 2>) -> SVector<S, 3> {
         SVector::from([state[0].cos(), state[0].sin(), state[1]])
     }

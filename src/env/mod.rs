@@ -57,7 +57,7 @@ pub struct Feature {
 pub enum Role {
     /// It has a course of its own.
     #[default]
-    State,
+    Dynamic,
     /// It stays as it is through an episode: a goal.
     Constant,
     /// It is the difference of two others, which are named.
@@ -72,7 +72,7 @@ pub enum Role {
 impl Feature {
     /// A feature around zero of size one.
     pub fn new(name: impl Into<String>) -> Self {
-        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::State, cube: None }
+        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::Dynamic, cube: None }
     }
 
     /// The same feature, which stays as it is through an episode.
@@ -149,7 +149,7 @@ pub trait Env: Send {
     /// What it looks like from outside.
     fn spec(&self) -> &Spec;
 
-    /// Starts an episode; the seed fixes everything that is drawn in it. Returns the first observation.
+    /// EvalSeeds an episode; the seed fixes everything that is drawn in it. Returns the first observation.
     fn reset(&mut self, seed: u64) -> Vec<f32>;
 
     /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.

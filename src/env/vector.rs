@@ -31,7 +31,7 @@ impl<E: Env> VectorEnv<E> {
         &self.envs
     }
 
-    /// Starts an episode in each of the first `seeds.len()` environments.
+    /// EvalSeeds an episode in each of the first `seeds.len()` environments.
     pub fn reset(&mut self, seeds: &[u64]) -> Vec<Vec<f32>> {
         self.envs.par_iter_mut().zip(seeds).map(|(env, &seed)| env.reset(seed)).collect()
     }

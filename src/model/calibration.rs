@@ -4,7 +4,7 @@ use std::f64::consts::{FRAC_1_SQRT_2, PI, TAU};
 
 /// A Gaussian prediction of one number, and what came.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Judged {
+pub struct GaussianForecast {
     /// The predicted mean.
     pub mean: f64,
     /// The predicted standard deviation.
@@ -13,7 +13,7 @@ pub struct Judged {
     pub outcome: f64,
 }
 
-impl Judged {
+impl GaussianForecast {
     /// How many deviations the outcome lies above the mean.
     pub fn z(&self) -> f64 {
         (self.outcome - self.mean) / self.deviation
@@ -40,15 +40,15 @@ impl Judged {
 }
 
 /// The share of outcomes inside the central interval that should hold a share `level` of them.
-pub fn coverage(judged: &[Judged], level: f64) -> f64 {
+pub fn coverage(judged: &[GaussianForecast], level: f64) -> f64 {
     let inside = judged.iter().filter(|j| (2.0 * j.pit() - 1.0).abs() <= level).count();
     inside as f64 / judged.len() as f64
 }
 
 /// The expected calibration error of regression (Kuleshov et al. 2018): over the levels 0.1, 0.2, ... 0.9 the mean
 /// distance between a level and the share of outcomes whose predicted probability is at most that.
-pub fn expected_calibration_error(judged: &[Judged]) -> f64 {
-    let pit: Vec<f64> = judged.iter().map(Judged::pit).collect();
+pub fn expected_calibration_error(judged: &[GaussianForecast]) -> f64 {
+    let pit: Vec<f64> = judged.iter().map(GaussianForecast::pit).collect();
     let distance = |level: f64| {
         let below = pit.iter().filter(|u| **u <= level).count();
         (below as f64 / pit.len() as f64 - level).abs()
@@ -58,7 +58,7 @@ pub fn expected_calibration_error(judged: &[Judged]) -> f64 {
 
 /// What all deviations must be multiplied by so that outcomes lie as far off as was predicted: the root mean square
 /// of z.
-pub fn temperature(judged: &[Judged]) -> f64 {
+pub fn temperature(judged: &[GaussianForecast]) -> f64 {
     (judged.iter().map(|j| j.z().powi(2)).sum::<f64>() / judged.len() as f64).sqrt()
 }
 
@@ -80,8 +80,9 @@ mod tests {
         let means = [0.0, 1.0, -0.5, 2.0, 0.3, 0.0, -1.0, 0.5];
         let deviations = [1.0, 0.5, 0.8, 1.5, 0.2, 2.0, 1.0, 0.7];
         let outcomes = [0.5, 1.9, -0.4, -0.5, 0.35, -1.0, -2.5, 0.4];
-        let judged: Vec<Judged> =
-            (0..8).map(|i| Judged { mean: means[i], deviation: deviations[i], outcome: outcomes[i] }).collect();
+        let judged: Vec<GaussianForecast> = (0..8)
+            .map(|i| GaussianForecast { mean: means[i], deviation: deviations[i], outcome: outcomes[i] })
+            .collect();
         let pit = [
             0.691_462_46,
             0.964_069_68,
@@ -110,7 +111,7 @@ mod tests {
             near(coverage(&judged, level), expected);
         }
         near(expected_calibration_error(&judged), 0.077_777_78);
-        near(judged.iter().map(Judged::nll).sum::<f64>() / 8.0, 1.250_109_05);
+        near(judged.iter().map(GaussianForecast::nll).sum::<f64>() / 8.0, 1.250_109_05);
         near(temperature(&judged), 1.052_752_99);
     }
 }

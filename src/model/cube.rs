@@ -43,7 +43,7 @@ impl Cube {
 
     /// The names under which it lies upright and looks ahead: its z-axis points as far up as any, its x-axis as far along the
     /// world's x as any that is left.
-    pub(super) fn upright(&self, obs: &[f32]) -> Names {
+    pub(super) fn canonicalize(&self, obs: &[f32]) -> Names {
         let axes = axes(&obs[self.observed..]);
         let most = |along: usize, not: usize| {
             let others = (0..3).filter(|k| *k != not);
@@ -64,7 +64,7 @@ impl Cube {
 
     /// Makes its axes one long, and at right angles. Number by number foretold they come out a little off, the third axis,
     /// their product, more so, and from step to step they would grow without end.
-    pub(super) fn straighten(&self, obs: &mut [f32]) {
+    pub(super) fn orthonormalize(&self, obs: &mut [f32]) {
         let [x, _, z] = axes(&obs[self.observed..]);
         let z = unit(z);
         let along: f32 = x.iter().zip(z).map(|(x, z)| x * z).sum();
@@ -75,7 +75,7 @@ impl Cube {
 
     /// Takes what is foretold of the cube when its axes are named so back to the names that `obs` has: changes, and their
     /// standard deviations, of all that is predicted.
-    pub(super) fn name_back(&self, names: Names, obs: &[f32], changes: &mut [f32], deviations: &mut [f32]) {
+    pub(super) fn decanonicalize(&self, names: Names, obs: &[f32], changes: &mut [f32], deviations: &mut [f32]) {
         let [x, y, z] = names.of(&axes(&obs[self.observed..]));
         let of = |numbers: &[f32]| -> [[f32; 3]; 2] {
             [0, 3].map(|from| std::array::from_fn(|i| numbers[self.predicted + from + i]))
@@ -125,7 +125,7 @@ mod tests {
     use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
     use super::*;
-    use crate::model::Layout;
+    use crate::model::FeatureMap;
     use crate::rng;
 
     const CUBE: Cube = Cube { observed: 0, predicted: 0 };
@@ -148,13 +148,13 @@ mod tests {
         for _ in 0..50 {
             let mut turn = lying(&mut rng);
             let mut named = observed(&turn);
-            CUBE.rename(CUBE.upright(&named), &mut named);
+            CUBE.rename(CUBE.canonicalize(&named), &mut named);
             assert!(named[5] > 0.57 && named[0] > 0.0, "upright and ahead: {named:?}");
             for i in 0..24 {
                 turn *= quarter(if i % 4 == 3 { Vector3::x_axis() } else { Vector3::z_axis() });
                 turn *= quarter(if i % 3 == 1 { Vector3::y_axis() } else { Vector3::z_axis() });
                 let mut other = observed(&turn);
-                CUBE.rename(CUBE.upright(&other), &mut other);
+                CUBE.rename(CUBE.canonicalize(&other), &mut other);
                 assert!(named.iter().zip(&other).all(|(a, b)| (a - b).abs() < 1e-5), "{named:?} {other:?}");
             }
         }
@@ -166,7 +166,7 @@ mod tests {
         let mut rng = rng::stream(2, "cube");
         let predicted = (0..6).collect();
         let layout =
-            Layout { width: 6, inputs: vec![], near: vec![], predicted, differences: vec![], cubes: vec![CUBE] };
+            FeatureMap { width: 6, inputs: vec![], near: vec![], predicted, differences: vec![], cubes: vec![CUBE] };
         for _ in 0..50 {
             let turn = lying(&mut rng);
             let straight = observed(&turn);
@@ -190,7 +190,7 @@ mod tests {
             let turn = lying(&mut rng);
             let by = UnitQuaternion::from_scaled_axis(Vector3::from_fn(|_, _| 0.1 * rng::normal(&mut rng)));
             let (before, after) = (observed(&turn), observed(&(by.to_rotation_matrix() * turn)));
-            let names = CUBE.upright(&before);
+            let names = CUBE.canonicalize(&before);
             let [mut from, mut to] = [before, after];
             CUBE.rename(names, &mut from);
             CUBE.rename(names, &mut to);
@@ -200,11 +200,11 @@ mod tests {
                 .map(|_| {
                     let mut drawn: Vec<f32> =
                         changes.iter().zip(&deviations).map(|(c, d)| c + d * rng::normal(&mut rng) as f32).collect();
-                    CUBE.name_back(names, &before, &mut drawn, &mut deviations.clone());
+                    CUBE.decanonicalize(names, &before, &mut drawn, &mut deviations.clone());
                     drawn.try_into().expect("six numbers")
                 })
                 .collect();
-            CUBE.name_back(names, &before, &mut changes, &mut deviations);
+            CUBE.decanonicalize(names, &before, &mut changes, &mut deviations);
             for i in 0..6 {
                 assert!(
                     (before[i] + changes[i] - after[i]).abs() < 1e-5,

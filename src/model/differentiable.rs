@@ -7,9 +7,9 @@
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
-use super::{Dynamics, Layout, Reward};
+use super::{Dynamics, FeatureMap, Reward};
 use crate::env::KnownReward;
-use crate::nn::{Activation, Learning, Mlp, Tensor3, device, ops, tensor, values};
+use crate::nn::{Activation, Grad, Mlp, Tensor3, device, ops, tensor, values};
 
 /// Step of the differences of a known reward.
 const STEP: f32 = 1e-3;
@@ -26,7 +26,7 @@ pub struct Differentiable {
     networks: Mlp,
     gated: bool,
     exit: Fixed,
-    layout: Layout,
+    layout: FeatureMap,
     members: usize,
     observation: usize,
     actions: usize,
@@ -49,7 +49,7 @@ impl Fixed {
     }
 
     fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>) -> Tensor3<T> {
-        ops::dense(x, &self.weight, &self.bias, Activation::Identity, Learning::Frozen)
+        ops::dense(x, &self.weight, &self.bias, Activation::Identity, Grad::Input)
     }
 }
 
@@ -115,14 +115,14 @@ impl Differentiable {
     }
 
     /// The returns of `actions` (`[candidates, horizon, action]`) from `obs`, and their gradients. A return is the mean
-    /// over the members' returns less `caution` times their standard deviation.
+    /// over the members' returns less `disagreement_penalty` times their standard deviation.
     pub fn gradients(
         &self,
         reward: Reward,
         obs: &[f32],
         actions: &[f32],
         horizon: usize,
-        caution: f32,
+        disagreement_penalty: f32,
     ) -> (Vec<f32>, Vec<f32>) {
         let (members, width) = (self.members, self.actions);
         let candidates = actions.len() / (horizon * width);
@@ -135,13 +135,13 @@ impl Differentiable {
             })
             .collect();
         let mut obs = obs.to_vec();
-        self.layout.upright(&mut obs, None);
+        self.layout.canonicalize(&mut obs, None);
         let start = tensor(&self.cpu, obs.repeat(members * candidates), (members, candidates, self.observation));
         let (mut state, mut tape) = start.leaky_traced().split_tape();
         let mut rewards: Vec<Tensor3> = Vec::with_capacity(horizon);
         for action in &step_actions {
             let input = ops::join(state.clone().put_tape(tape), action.clone());
-            let head = self.networks.forward(self.read(input), Learning::Frozen);
+            let head = self.networks.forward(self.read(input), Grad::Input);
             let head = if self.gated { ops::gated(head) } else { head };
             let changes = head.slice((.., .., ..self.outputs));
             let (changes, so_far) = changes.split_tape();
@@ -159,7 +159,7 @@ impl Differentiable {
         let mut rewards = rewards.into_iter();
         let first = rewards.next().expect("at least one step").put_tape(tape);
         let total = rewards.fold(first, |total, reward| total + reward);
-        let (returns, weights) = weigh(values(&total), members, caution);
+        let (returns, weights) = weigh(values(&total), members, disagreement_penalty);
         let weights = tensor(&self.cpu, weights, (members, candidates, 1));
         let mut gradients = (total * weights).sum::<Rank0, _>().backward();
         let mut slopes = vec![0.0; actions.len()];
@@ -174,9 +174,9 @@ impl Differentiable {
     }
 }
 
-/// Mean less `caution` deviations over the members (`returns` is `[members, candidates]`), and how it changes with each
+/// Mean less `disagreement_penalty` deviations over the members (`returns` is `[members, candidates]`), and how it changes with each
 /// member's return.
-fn weigh(returns: &[f32], members: usize, caution: f32) -> (Vec<f32>, Vec<f32>) {
+fn weigh(returns: &[f32], members: usize, disagreement_penalty: f32) -> (Vec<f32>, Vec<f32>) {
     let candidates = returns.len() / members;
     let n = members as f32;
     let mut scores = vec![0.0; candidates];
@@ -185,9 +185,9 @@ fn weigh(returns: &[f32], members: usize, caution: f32) -> (Vec<f32>, Vec<f32>) 
         let own = || (0..members).map(|m| returns[m * candidates + c]);
         let mean = own().sum::<f32>() / n;
         let deviation = (own().map(|r| (r - mean).powi(2)).sum::<f32>() / n).sqrt();
-        scores[c] = mean - caution * deviation;
+        scores[c] = mean - disagreement_penalty * deviation;
         for (m, r) in own().enumerate() {
-            weights[m * candidates + c] = (1.0 - caution * (r - mean) / deviation.max(1e-6)) / n;
+            weights[m * candidates + c] = (1.0 - disagreement_penalty * (r - mean) / deviation.max(1e-6)) / n;
         }
     }
     (scores, weights)

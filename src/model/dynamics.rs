@@ -3,7 +3,7 @@
 use dfdx::tensor::Cpu;
 
 use super::uncertainty::split;
-use super::{Layout, Normaliser};
+use super::{FeatureMap, Normaliser};
 use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
 use crate::nn::kernels::vectorised_fn;
 use crate::nn::{Activation, Mlp, bounded_variance, ops};
@@ -12,7 +12,7 @@ use crate::nn::{Activation, Mlp, bounded_variance, ops};
 #[derive(Clone, Debug)]
 pub struct Dynamics {
     members: Vec<FrozenMlp>,
-    pub(super) layout: Layout,
+    pub(super) layout: FeatureMap,
     actions: usize,
     pub(super) inputs: Normaliser,
     pub(super) targets: Normaliser,
@@ -48,7 +48,7 @@ pub(super) struct Scratch {
 impl Dynamics {
     pub(super) fn new<'a>(
         members: impl Iterator<Item = (FrozenMlp, [&'a [f32]; 2])>,
-        layout: Layout,
+        layout: FeatureMap,
         actions: usize,
         inputs: Normaliser,
         targets: Normaliser,
@@ -89,14 +89,14 @@ impl Dynamics {
 
     /// What the members say of one step from `obs` by `action`.
     pub fn predict(&self, obs: &[f32], action: &[f32]) -> Prediction {
-        let (means, variances) = self.opinions(obs, action);
+        let (means, variances) = self.member_predictions(obs, action);
         let [mean, aleatoric, epistemic] = split(&means, &variances);
         Prediction { mean, aleatoric, epistemic }
     }
 
     /// Mean and variance that each member gives for what is predicted of the observation after a step (and the reward, if
     /// learned).
-    pub fn opinions(&self, obs: &[f32], action: &[f32]) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
+    pub fn member_predictions(&self, obs: &[f32], action: &[f32]) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
         let outputs = self.outputs();
         let mut scratch = Scratch::default();
         let opinion = |member: usize| {
@@ -149,7 +149,7 @@ impl Dynamics {
                 if !self.layout.cubes.is_empty() {
                     upright.clear();
                     upright.extend_from_slice(state);
-                    self.layout.upright(upright, None);
+                    self.layout.canonicalize(upright, None);
                     state = upright;
                 }
                 let read = self.layout.read(state).chain(action.iter().copied());
@@ -168,7 +168,7 @@ impl Dynamics {
         if !self.layout.cubes.is_empty() {
             for (&row, head) in asked.iter().zip(heads.chunks_exact_mut(2 * self.outputs())) {
                 let (changes, deviations) = head.split_at_mut(self.outputs());
-                self.layout.name_back(state_of(row), changes, deviations);
+                self.layout.decanonicalize(state_of(row), changes, deviations);
             }
         }
         heads

@@ -16,13 +16,13 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{Dynamics, Layout, Normaliser};
+use super::{Dynamics, FeatureMap, Normaliser};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::frozen::FrozenMlp;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, Learning, LogVarianceBounds, Mlp, MlpConfig, Norm, Tensor3, Weights,
-    bounded_nll, device, ops, parameters_of_fields, tensor, values,
+    Activation, Adam, AdamConfig, Grad, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, Tensor3, Weights, bounded_nll,
+    device, ops, parameters_of_fields, tensor, values,
 };
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
@@ -50,7 +50,7 @@ pub struct EnsembleConfig {
     pub learning_rate: f32,
     /// Share of the step size that is left at the end of a fit, to which it falls in a straight line; 1 keeps it. What
     /// plans are made in at the end is then less at the mercy of the last minibatches.
-    pub anneal: f32,
+    pub final_learning_rate_fraction: f32,
     /// Decay of weights, in units of the step size.
     pub weight_decay: f32,
     /// Transitions in a minibatch of each network.
@@ -89,7 +89,7 @@ impl Default for EnsembleConfig {
             elites: 5,
             hidden: vec![200; 3],
             learning_rate: 1e-3,
-            anneal: 1.0,
+            final_learning_rate_fraction: 1.0,
             weight_decay: 1e-2,
             batch: 256,
             bootstrap: false,
@@ -125,7 +125,7 @@ impl EnsembleConfig {
         if !(0.0..0.9).contains(&self.held_out) {
             return Err(Error::BadSetting("ensemble: `held_out` must lie in [0, 0.9)".into()));
         }
-        if !(0.0..=1.0).contains(&self.anneal) {
+        if !(0.0..=1.0).contains(&self.final_learning_rate_fraction) {
             return Err(Error::BadSetting("ensemble: `anneal` must lie between 0 and 1".into()));
         }
         Ok(())
@@ -133,7 +133,7 @@ impl EnsembleConfig {
 
     /// The size of a step, `step` steps after a fit of `steps` began.
     fn learning_rate_at(&self, step: usize, steps: usize) -> f32 {
-        self.learning_rate * (1.0 - (1.0 - self.anneal) * step as f32 / steps as f32)
+        self.learning_rate * (1.0 - (1.0 - self.final_learning_rate_fraction) * step as f32 / steps as f32)
     }
 }
 
@@ -152,7 +152,7 @@ pub struct Fit {
 /// The networks, and what belongs to them.
 pub struct Ensemble {
     config: EnsembleConfig,
-    layout: Layout,
+    layout: FeatureMap,
     /// Typical size of each number of an observation.
     sizes: Vec<f32>,
     actions: usize,
@@ -173,7 +173,7 @@ impl Ensemble {
     pub fn new(spec: &Spec, config: EnsembleConfig, rng: &mut Rng) -> Result<Self> {
         config.check()?;
         let cpu = device();
-        let (layout, actions) = (Layout::new(spec)?, spec.action_size);
+        let (layout, actions) = (FeatureMap::new(spec)?, spec.action_size);
         let inputs = layout.reads() + actions;
         let outputs = layout.predicted.len() + usize::from(config.learn_reward);
         let shape = MlpConfig {
@@ -278,7 +278,7 @@ impl Ensemble {
         for i in 0..data.len() {
             let row = data.row(i);
             let (mut obs, mut next) = (row.obs.to_vec(), row.next_obs.to_vec());
-            self.layout.upright(&mut obs, Some(&mut next));
+            self.layout.canonicalize(&mut obs, Some(&mut next));
             inputs.extend(self.layout.read(&obs).chain(row.action.iter().copied()));
             targets.extend(self.layout.predicted.iter().map(|i| next[*i] - obs[*i]));
             if self.config.learn_reward {
@@ -362,8 +362,7 @@ impl Ensemble {
     /// What each network says of some rows, `[rows, 2 outputs]`, and the targets there.
     fn judged(&self, data: &Data, rows: &[usize]) -> (Vec<Vec<f32>>, Vec<f32>) {
         let x = data.inputs_of(rows);
-        let head =
-            |member: &Member| values(&member.learner.head(x.clone(), self.config.gated, Learning::Frozen)).to_vec();
+        let head = |member: &Member| values(&member.learner.head(x.clone(), self.config.gated, Grad::Input)).to_vec();
         (self.members.par_iter().map(head).collect(), values(&data.targets_of(rows)).to_vec())
     }
 
@@ -433,8 +432,8 @@ struct Member {
 impl Member {
     /// One gradient step of this size on the given rows. Returns the loss.
     fn learn(&mut self, data: &Data, rows: &[usize], rate: f32, config: &EnsembleConfig) -> f32 {
-        let head = self.learner.head(data.inputs_of(rows).leaky_traced(), config.gated, Learning::FromData);
-        let learning = if config.learn_bounds { Learning::Trained } else { Learning::Frozen };
+        let head = self.learner.head(data.inputs_of(rows).leaky_traced(), config.gated, Grad::Params);
+        let learning = if config.learn_bounds { Grad::Both } else { Grad::Input };
         let loss = bounded_nll(head, &data.targets_of(rows), &self.learner.bounds, config.beta, learning);
         let answer = values(&loss)[0];
         self.optimiser.set_learning_rate(rate);
@@ -454,7 +453,7 @@ parameters_of_fields!(Learner: network, bounds);
 
 impl Learner {
     /// Means and raw log-variances, `[1, batch, 2 outputs]`.
-    fn head<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, gated: bool, learning: Learning) -> Tensor3<T> {
+    fn head<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, gated: bool, learning: Grad) -> Tensor3<T> {
         let head = self.network.forward(x, learning);
         if gated { ops::gated(head) } else { head }
     }

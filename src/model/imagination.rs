@@ -1,6 +1,6 @@
 //! Letting a model run ahead: many action sequences, several possible futures for each.
 //!
-//! All candidates meet the same luck (the same noise, the same order of members), so that what differs between them
+//! All candidates meet the same noise (the same noise, the same order of members), so that what differs between them
 //! is due to their actions. A candidate's futures depend on nothing but the seed, neither on the other candidates
 //! nor on the number of threads.
 
@@ -28,9 +28,9 @@ pub enum Propagation {
     Ts1,
     /// Each member follows its own mean, without chance: what is left is disagreement. For worlds without dice, where
     /// a planner would bet on lucky noise.
-    Members,
+    TsInfMean,
     /// One future: the average of the members' means, without chance.
-    Mean,
+    Expectation,
     /// Particles are drawn from the mixture of all members, and drawn anew at every step from a Gaussian fitted to them.
     MomentMatching,
 }
@@ -56,7 +56,7 @@ pub struct Imagination<'a> {
     pub reward: Reward<'a>,
     /// How uncertainty is carried on.
     pub propagation: Propagation,
-    /// Futures of each candidate, a multiple of the members. (Where members follow their means there is one for each of
+    /// ImaginedReturns of each candidate, a multiple of the members. (Where members follow their means there is one for each of
     /// them, and one in all where only the mean of means is followed.)
     pub particles: usize,
     /// What the state at the horizon's end is worth beyond it, if anything is known of that.
@@ -65,8 +65,8 @@ pub struct Imagination<'a> {
 
 /// What may become of candidates.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Futures {
-    /// Futures of each candidate.
+pub struct ImaginedReturns {
+    /// ImaginedReturns of each candidate.
     pub particles: usize,
     /// Sums of rewards (and value at the end), `[candidates, particles]`.
     pub returns: Vec<f32>,
@@ -76,11 +76,11 @@ pub struct Futures {
 }
 
 impl Imagination<'_> {
-    /// Futures drawn for each candidate.
+    /// ImaginedReturns drawn for each candidate.
     pub fn particles(&self) -> usize {
         match self.propagation {
-            Propagation::Mean => 1,
-            Propagation::Members => self.dynamics.members(),
+            Propagation::Expectation => 1,
+            Propagation::TsInfMean => self.dynamics.members(),
             _ => self.particles,
         }
     }
@@ -91,11 +91,11 @@ impl Imagination<'_> {
     /// # Panics
     /// If the sizes do not fit together, the particles cannot be shared out over the members, or the model has not
     /// learned the rewards that are asked of it.
-    pub fn futures(&self, obs: &[f32], actions: &[f32], horizon: usize, rng: &mut Rng) -> Futures {
+    pub fn imagined_returns(&self, obs: &[f32], actions: &[f32], horizon: usize, rng: &mut Rng) -> ImaginedReturns {
         let width = horizon * self.dynamics.action_size();
         let (count, particles) = (actions.len() / width, self.particles());
         assert_eq!(count * width, actions.len(), "whole sequences");
-        let luck = Luck::draw(self, horizon, rng);
+        let noise = CommonRandomNumbers::draw(self, horizon, rng);
         let mut returns = vec![0.0; count * particles];
         let mut disagreement = vec![0.0; count];
         let share = self.share(count);
@@ -103,9 +103,9 @@ impl Imagination<'_> {
         let parts = parts.zip(actions.par_chunks(share * width)).enumerate();
         parts.for_each(|(part, ((returns, disagreement), actions))| {
             let obs = self.starts(obs, part * share, returns.len() / particles);
-            self.run(&obs, actions, horizon, &luck, returns, disagreement, &mut |_, _| {});
+            self.run(&obs, actions, horizon, &noise, returns, disagreement, &mut |_, _| {});
         });
-        Futures { particles, returns, disagreement }
+        ImaginedReturns { particles, returns, disagreement }
     }
 
     /// The ways themselves: for each step from 0 to `horizon` the observations of all futures,
@@ -113,26 +113,32 @@ impl Imagination<'_> {
     ///
     /// # Panics
     /// As [`Imagination::futures`].
-    pub fn paths(&self, obs: &[f32], actions: &[f32], horizon: usize, rng: &mut Rng) -> (Vec<Vec<f32>>, Futures) {
+    pub fn trajectories(
+        &self,
+        obs: &[f32],
+        actions: &[f32],
+        horizon: usize,
+        rng: &mut Rng,
+    ) -> (Vec<Vec<f32>>, ImaginedReturns) {
         let count = actions.len() / (horizon * self.dynamics.action_size());
         let particles = self.particles();
-        let luck = Luck::draw(self, horizon, rng);
+        let noise = CommonRandomNumbers::draw(self, horizon, rng);
         let (mut returns, mut disagreement) = (vec![0.0; count * particles], vec![0.0; count]);
         let mut paths = Vec::with_capacity(horizon + 1);
         let obs = self.starts(obs, 0, count);
-        self.run(&obs, actions, horizon, &luck, &mut returns, &mut disagreement, &mut |_, states: &[f32]| {
+        self.run(&obs, actions, horizon, &noise, &mut returns, &mut disagreement, &mut |_, states: &[f32]| {
             paths.push(states.to_vec());
         });
-        (paths, Futures { particles, returns, disagreement })
+        (paths, ImaginedReturns { particles, returns, disagreement })
     }
 
     /// Candidates that one thread takes on at a time.
     fn share(&self, count: usize) -> usize {
         let rows = match self.propagation {
-            Propagation::TsInf | Propagation::Ts1 | Propagation::Members => {
+            Propagation::TsInf | Propagation::Ts1 | Propagation::TsInfMean => {
                 count * self.particles() / self.dynamics.members()
             }
-            Propagation::Mean | Propagation::MomentMatching => count * self.particles(),
+            Propagation::Expectation | Propagation::MomentMatching => count * self.particles(),
         };
         let parts = rows.div_ceil(ROWS).next_multiple_of(rayon::current_num_threads());
         count.div_ceil(parts).max(1)
@@ -151,7 +157,7 @@ impl Imagination<'_> {
         obs: &[f32],
         actions: &[f32],
         horizon: usize,
-        luck: &Luck,
+        noise: &CommonRandomNumbers,
         returns: &mut [f32],
         disagreement: &mut [f32],
         visit: &mut impl FnMut(usize, &[f32]),
@@ -171,12 +177,12 @@ impl Imagination<'_> {
                 now.copy_from_slice(&actions[(row % candidates * horizon + t) * width..][..width]);
             }
             match self.propagation {
-                Propagation::TsInf | Propagation::Ts1 | Propagation::Members => {
-                    self.sample(t == 0, &states, &now, &mut next, &mut rewards, luck.at(t), &mut scratch);
-                    self.add_spread_between_members(&next, luck.at(t), disagreement);
+                Propagation::TsInf | Propagation::Ts1 | Propagation::TsInfMean => {
+                    self.sample(t == 0, &states, &now, &mut next, &mut rewards, noise.at(t), &mut scratch);
+                    self.add_spread_between_members(&next, noise.at(t), disagreement);
                 }
-                Propagation::Mean | Propagation::MomentMatching => {
-                    self.mix(&states, &now, &mut next, &mut rewards, luck.at(t), disagreement, &mut scratch);
+                Propagation::Expectation | Propagation::MomentMatching => {
+                    self.mix(&states, &now, &mut next, &mut rewards, noise.at(t), disagreement, &mut scratch);
                 }
             }
             if let Reward::Known(known) = self.reward {
@@ -214,20 +220,20 @@ impl Imagination<'_> {
         actions: &[f32],
         next: &mut [f32],
         rewards: &mut [f32],
-        luck: LuckOfStep,
+        noise: StepNoise,
         scratch: &mut Scratch,
     ) {
         let (width, outputs) = (self.dynamics.observation_size(), self.dynamics.outputs());
         let predicted = &self.dynamics.layout.predicted;
         let rewarded = self.dynamics.predicts_reward().then_some(predicted.len());
-        let particles = luck.order.len();
+        let particles = noise.order.len();
         let candidates = rewards.len() / particles;
-        for (member, flock) in luck.order.chunks_exact(particles / self.dynamics.members()).enumerate() {
-            let asking = if together { &flock[..1] } else { flock };
+        for (member, particles_of_member) in noise.order.chunks_exact(particles / self.dynamics.members()).enumerate() {
+            let asking = if together { &particles_of_member[..1] } else { particles_of_member };
             let rows = asking.iter().flat_map(|p| p * candidates..(p + 1) * candidates);
             let head = self.dynamics.ask(member, rows, states, actions, scratch);
-            for (&p, head) in flock.iter().zip(head.chunks_exact(candidates * 2 * outputs).cycle()) {
-                let noise = &luck.noise[p * outputs..][..outputs];
+            for (&p, head) in particles_of_member.iter().zip(head.chunks_exact(candidates * 2 * outputs).cycle()) {
+                let noise = &noise.noise[p * outputs..][..outputs];
                 let rows = p * candidates * width..(p + 1) * candidates * width;
                 let rows = states[rows.clone()].chunks_exact(width).zip(next[rows].chunks_exact_mut(width));
                 let rewards = &mut rewards[p * candidates..][..candidates];
@@ -253,7 +259,7 @@ impl Imagination<'_> {
         actions: &[f32],
         next: &mut [f32],
         rewards: &mut [f32],
-        luck: LuckOfStep,
+        noise: StepNoise,
         disagreement: &mut [f32],
         scratch: &mut Scratch,
     ) {
@@ -280,8 +286,8 @@ impl Imagination<'_> {
             let between = |j: usize| (squares[j] - means[j] * means[j]).max(0.0);
             let drawn = |j: usize| {
                 let chance = match self.propagation {
-                    Propagation::Mean => 0.0,
-                    _ => (variances[j] + between(j)).sqrt() * luck.noise[row / candidates * outputs + j % outputs],
+                    Propagation::Expectation => 0.0,
+                    _ => (variances[j] + between(j)).sqrt() * noise.noise[row / candidates * outputs + j % outputs],
                 };
                 means[j] + chance
             };
@@ -300,7 +306,7 @@ impl Imagination<'_> {
         }
         if self.propagation == Propagation::MomentMatching {
             // A Gaussian for each number of each candidate, and new particles from it.
-            let noise = &luck.noise[particles * outputs..];
+            let noise = &noise.noise[particles * outputs..];
             for c in 0..candidates {
                 for (j, &i) in predicted.iter().enumerate() {
                     let at = |p: usize| (p * candidates + c) * width + i;
@@ -314,17 +320,17 @@ impl Imagination<'_> {
     }
 
     /// Adds how far the members' particles have come apart.
-    fn add_spread_between_members(&self, states: &[f32], luck: LuckOfStep, disagreement: &mut [f32]) {
+    fn add_spread_between_members(&self, states: &[f32], noise: StepNoise, disagreement: &mut [f32]) {
         let width = self.dynamics.observation_size();
         let (members, candidates) = (self.dynamics.members(), disagreement.len());
-        let flock = luck.order.len() / members;
+        let particles_of_member = noise.order.len() / members;
         let mut means = vec![0.0; members * width];
         for (c, disagreement) in disagreement.iter_mut().enumerate() {
             means.fill(0.0);
-            for (place, p) in luck.order.iter().enumerate() {
+            for (place, p) in noise.order.iter().enumerate() {
                 let state = &states[(p * candidates + c) * width..][..width];
-                let mean = &mut means[place / flock * width..][..width];
-                mean.iter_mut().zip(state).for_each(|(m, x)| *m += x / flock as f32);
+                let mean = &mut means[place / particles_of_member * width..][..width];
+                mean.iter_mut().zip(state).for_each(|(m, x)| *m += x / particles_of_member as f32);
             }
             let spread: f32 = self
                 .dynamics
@@ -341,7 +347,7 @@ impl Imagination<'_> {
 }
 
 /// What chance decides, the same for all candidates.
-struct Luck {
+struct CommonRandomNumbers {
     particles: usize,
     /// Standard normal numbers, `[horizon, draws, outputs]`, and how many there are in a step.
     noise: Vec<f32>,
@@ -350,14 +356,14 @@ struct Luck {
     order: Vec<usize>,
 }
 
-/// [`Luck`] in one step.
+/// [`CommonRandomNumbers`] in one step.
 #[derive(Clone, Copy)]
-struct LuckOfStep<'a> {
+struct StepNoise<'a> {
     noise: &'a [f32],
     order: &'a [usize],
 }
 
-impl Luck {
+impl CommonRandomNumbers {
     fn draw(imagination: &Imagination, horizon: usize, rng: &mut Rng) -> Self {
         let Imagination { dynamics, reward, propagation, .. } = *imagination;
         let particles = imagination.particles();
@@ -367,13 +373,13 @@ impl Luck {
                 assert!(particles.is_multiple_of(dynamics.members()), "as many particles with each member");
                 particles
             }
-            Propagation::Members => particles,
-            Propagation::Mean => 0,
+            Propagation::TsInfMean => particles,
+            Propagation::Expectation => 0,
             // New particles are drawn from the fitted Gaussian with noise of their own.
             Propagation::MomentMatching => 2 * particles,
         };
         let noise_per_step = draws * dynamics.outputs();
-        let noise = if propagation == Propagation::Members {
+        let noise = if propagation == Propagation::TsInfMean {
             vec![0.0; horizon * noise_per_step]
         } else {
             (0..horizon * noise_per_step).map(|_| rng::normal(rng) as f32).collect()
@@ -389,8 +395,8 @@ impl Luck {
         Self { particles, noise, noise_per_step, order }
     }
 
-    fn at(&self, t: usize) -> LuckOfStep<'_> {
-        LuckOfStep {
+    fn at(&self, t: usize) -> StepNoise<'_> {
+        StepNoise {
             noise: &self.noise[t * self.noise_per_step..][..self.noise_per_step],
             order: &self.order[t * self.particles..][..self.particles],
         }
@@ -400,7 +406,7 @@ impl Luck {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{Layout, Normaliser};
+    use crate::model::{FeatureMap, Normaliser};
     use crate::nn::Activation;
     use crate::nn::frozen::FrozenMlp;
 
@@ -417,8 +423,14 @@ mod tests {
             (network, [&[5.0][..], &[-40.0]])
         });
         let identity = Normaliser::identity;
-        let layout =
-            Layout { width: 1, inputs: vec![0], near: vec![], predicted: vec![0], differences: vec![], cubes: vec![] };
+        let layout = FeatureMap {
+            width: 1,
+            inputs: vec![0],
+            near: vec![],
+            predicted: vec![0],
+            differences: vec![],
+            cubes: vec![],
+        };
         Dynamics::new(members, layout, 1, identity(2), identity(1), vec![1.0])
     }
 
@@ -450,7 +462,8 @@ mod tests {
         let dynamics = disputed(1.0, 1e-3);
         let run = |propagation, particles| {
             let mut rng = rng::stream(0, "propagation");
-            let (paths, futures) = imagine(&dynamics, propagation, particles).paths(&[0.0], &[0.0; 16], 16, &mut rng);
+            let (paths, futures) =
+                imagine(&dynamics, propagation, particles).trajectories(&[0.0], &[0.0; 16], 16, &mut rng);
             (spread(&paths[16]), futures.disagreement[0])
         };
         let ((mean, deviation), apart) = run(Propagation::TsInf, 400);
@@ -460,7 +473,7 @@ mod tests {
             let ((mean, deviation), _) = run(propagation, 400);
             assert!(mean.abs() < 2.5 && (deviation - 4.0).abs() < 0.8, "{propagation:?}: {mean} {deviation}");
         }
-        let ((mean, deviation), apart) = run(Propagation::Mean, 400);
+        let ((mean, deviation), apart) = run(Propagation::Expectation, 400);
         assert!(mean.abs() < 1e-5 && deviation == 0.0 && (apart - 16.0).abs() < 1e-3, "{mean} {deviation} {apart}");
     }
 
@@ -469,7 +482,7 @@ mod tests {
         let dynamics = disputed(0.0, 0.5);
         for propagation in [Propagation::TsInf, Propagation::Ts1, Propagation::MomentMatching] {
             let mut rng = rng::stream(1, "chance");
-            let (paths, _) = imagine(&dynamics, propagation, 1000).paths(&[0.0], &[0.0; 9], 9, &mut rng);
+            let (paths, _) = imagine(&dynamics, propagation, 1000).trajectories(&[0.0], &[0.0; 9], 9, &mut rng);
             let (_, deviation) = spread(&paths[9]);
             assert!((deviation - 1.5).abs() < 0.15, "{propagation:?}: {deviation}");
         }
@@ -483,7 +496,7 @@ mod tests {
         let mut imagination = imagine(&dynamics, Propagation::TsInf, 2);
         imagination.value = Some(&four);
         let futures =
-            imagination.futures(&[0.0], &[vec![1.0; 8], vec![0.5; 8]].concat(), 8, &mut rng::stream(2, "end"));
+            imagination.imagined_returns(&[0.0], &[vec![1.0; 8], vec![0.5; 8]].concat(), 8, &mut rng::stream(2, "end"));
         let near = |found: f32, expected: f32| assert!((found - expected).abs() < 1e-3, "{found}, expected {expected}");
         near(futures.returns[0], 15.0);
         near(futures.returns[2], 18.0 + 100.0);
@@ -494,13 +507,17 @@ mod tests {
     fn futures_depend_on_the_seed_alone() {
         let dynamics = disputed(0.3, 0.2);
         let actions: Vec<f32> = (0..300).map(|i| (i as f32 * 0.7).sin()).collect();
-        for propagation in
-            [Propagation::TsInf, Propagation::Ts1, Propagation::Members, Propagation::Mean, Propagation::MomentMatching]
-        {
+        for propagation in [
+            Propagation::TsInf,
+            Propagation::Ts1,
+            Propagation::TsInfMean,
+            Propagation::Expectation,
+            Propagation::MomentMatching,
+        ] {
             let run = |threads: usize, actions: &[f32]| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
                 let imagination = imagine(&dynamics, propagation, 4);
-                pool.install(|| imagination.futures(&[0.1], actions, 5, &mut rng::stream(3, "threads")))
+                pool.install(|| imagination.imagined_returns(&[0.1], actions, 5, &mut rng::stream(3, "threads")))
             };
             let one = run(1, &actions);
             assert_eq!(one, run(3, &actions), "{propagation:?}");

@@ -13,7 +13,7 @@ pub(super) const NEAR: f32 = 4.0;
 
 /// Which numbers of an observation are which.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Layout {
+pub struct FeatureMap {
     /// Numbers in an observation.
     pub width: usize,
     /// Those that networks read: what has a course of its own, and differences of such.
@@ -29,7 +29,7 @@ pub struct Layout {
     pub cubes: Vec<Cube>,
 }
 
-impl Layout {
+impl FeatureMap {
     /// The layout of an environment's observations.
     ///
     /// # Errors
@@ -45,7 +45,7 @@ impl Layout {
         };
         for (i, feature) in features.iter().enumerate() {
             match &feature.role {
-                Role::State => {
+                Role::Dynamic => {
                     inputs.push(i);
                     predicted.push(i);
                 }
@@ -53,7 +53,7 @@ impl Layout {
                 Role::Difference { minuend, subtrahend } => {
                     let (a, b) = (find(minuend)?, find(subtrahend)?);
                     differences.push([i, a, b]);
-                    if [a, b].iter().all(|part| features[*part].role == Role::State) {
+                    if [a, b].iter().all(|part| features[*part].role == Role::Dynamic) {
                         inputs.push(i);
                         near.push((i, NEAR / feature.scale));
                     }
@@ -79,9 +79,9 @@ impl Layout {
     }
 
     /// Names the axes of each cube so that it lies upright and looks ahead; and those in `after` (what came next) alike.
-    pub fn upright(&self, obs: &mut [f32], mut after: Option<&mut [f32]>) {
+    pub fn canonicalize(&self, obs: &mut [f32], mut after: Option<&mut [f32]>) {
         for cube in &self.cubes {
-            let names = cube.upright(obs);
+            let names = cube.canonicalize(obs);
             cube.rename(names, obs);
             if let Some(after) = &mut after {
                 cube.rename(names, after);
@@ -91,8 +91,8 @@ impl Layout {
 
     /// Takes what is foretold of an upright `obs` back to the names that it has: changes of all that is predicted, and
     /// their standard deviations.
-    pub fn name_back(&self, obs: &[f32], changes: &mut [f32], deviations: &mut [f32]) {
-        self.cubes.iter().for_each(|cube| cube.name_back(cube.upright(obs), obs, changes, deviations));
+    pub fn decanonicalize(&self, obs: &[f32], changes: &mut [f32], deviations: &mut [f32]) {
+        self.cubes.iter().for_each(|cube| cube.decanonicalize(cube.canonicalize(obs), obs, changes, deviations));
     }
 
     /// Puts right, in an observation whose predicted numbers are new, what follows from them: differences; and that the axes
@@ -101,6 +101,6 @@ impl Layout {
         for &[i, a, b] in &self.differences {
             obs[i] = obs[a] - obs[b];
         }
-        self.cubes.iter().for_each(|cube| cube.straighten(obs));
+        self.cubes.iter().for_each(|cube| cube.orthonormalize(obs));
     }
 }

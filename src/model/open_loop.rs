@@ -3,7 +3,7 @@
 use rand::seq::IndexedRandom;
 use serde::{Deserialize, Serialize};
 
-use super::calibration::{Judged, coverage};
+use super::calibration::{GaussianForecast, coverage};
 use super::{Dynamics, Imagination, Propagation, Reward};
 use crate::env::KnownReward;
 use crate::rng::Rng;
@@ -11,16 +11,16 @@ use crate::rng::Rng;
 /// How far ahead models are judged, in steps.
 pub const HORIZONS: [usize; 6] = [1, 2, 5, 10, 15, 25];
 
-/// Starts from which a model is judged.
+/// EvalSeeds from which a model is judged.
 const STARTS: usize = 200;
-/// Futures for each member and start.
+/// ImaginedReturns for each member and start.
 const PARTICLES_PER_MEMBER: usize = 4;
 /// Numbers whose displacement varies less than this share of its typical step are not judged: they stand still.
 const STILL: f64 = 1e-3;
 
 /// An episode as it happened: what was done, and what was seen before and after each action.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Trace {
+pub struct Episode {
     /// Observations, one more than actions.
     pub observations: Vec<Vec<f32>>,
     /// Actions.
@@ -48,42 +48,42 @@ pub struct OpenLoop {
 }
 
 /// Something that foresees what comes of actions.
-pub trait Foresee {
+pub trait OpenLoopModel {
     /// The numbers of an observation that it foresees, and by how much each typically changes in a step.
-    fn foreseen(&self) -> Vec<(usize, f32)>;
+    fn predicted(&self) -> Vec<(usize, f32)>;
 
     /// What may be observed after each of 0 to `ahead` steps, if from each start its episode's actions are repeated:
     /// `[particles, starts, observation]` each. Of an episode it may look at all up to its start.
-    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
 }
 
 /// Judges a model on episodes that it has not learned from. Horizons longer than the episodes are left out.
-pub fn open_loop(model: &impl Foresee, traces: &[Trace], rng: &mut Rng) -> Vec<OpenLoop> {
-    let longest = traces.iter().map(|trace| trace.actions.len()).max().unwrap_or(0);
+pub fn open_loop(model: &impl OpenLoopModel, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
+    let longest = episodes.iter().map(|episode| episode.actions.len()).max().unwrap_or(0);
     let horizons: Vec<usize> = HORIZONS.into_iter().filter(|k| *k <= longest).collect();
     let Some(&ahead) = horizons.last() else { return Vec::new() };
-    let all: Vec<(&Trace, usize)> = traces
+    let all: Vec<(&Episode, usize)> = episodes
         .iter()
-        .flat_map(|trace| (0..(trace.actions.len() + 1).saturating_sub(ahead)).map(move |t| (trace, t)))
+        .flat_map(|episode| (0..(episode.actions.len() + 1).saturating_sub(ahead)).map(move |t| (episode, t)))
         .collect();
-    let starts: Vec<(&Trace, usize)> = all.sample(rng, STARTS).copied().collect();
-    let futures = model.futures(&starts, ahead, rng);
-    let foreseen = model.foreseen();
+    let starts: Vec<(&Episode, usize)> = all.sample(rng, STARTS).copied().collect();
+    let futures = model.open_loop_predictions(&starts, ahead, rng);
+    let foreseen = model.predicted();
     horizons.into_iter().map(|k| judge(&foreseen, &starts, &futures[k], k)).collect()
 }
 
 /// The actions that follow a start.
-pub(crate) fn actions_from<'a>((trace, t): (&'a Trace, usize), ahead: usize) -> impl Iterator<Item = f32> + 'a {
-    trace.actions[t..t + ahead].iter().flatten().copied()
+pub(crate) fn actions_from<'a>((episode, t): (&'a Episode, usize), ahead: usize) -> impl Iterator<Item = f32> + 'a {
+    episode.actions[t..t + ahead].iter().flatten().copied()
 }
 
-impl Foresee for Dynamics {
-    fn foreseen(&self) -> Vec<(usize, f32)> {
+impl OpenLoopModel for Dynamics {
+    fn predicted(&self) -> Vec<(usize, f32)> {
         self.typical_changes().collect()
     }
 
-    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
-        let obs: Vec<f32> = starts.iter().flat_map(|(trace, t)| trace.observations[*t].iter().copied()).collect();
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        let obs: Vec<f32> = starts.iter().flat_map(|(episode, t)| episode.observations[*t].iter().copied()).collect();
         let actions: Vec<f32> = starts.iter().flat_map(|start| actions_from(*start, ahead)).collect();
         let imagination = Imagination {
             dynamics: self,
@@ -92,12 +92,12 @@ impl Foresee for Dynamics {
             particles: PARTICLES_PER_MEMBER * self.members(),
             value: None,
         };
-        imagination.paths(&obs, &actions, ahead, rng).0
+        imagination.trajectories(&obs, &actions, ahead, rng).0
     }
 }
 
 /// Judges the states after `k` steps, `[particles, starts, observation]`.
-fn judge(foreseen: &[(usize, f32)], starts: &[(&Trace, usize)], states: &[f32], k: usize) -> OpenLoop {
+fn judge(foreseen: &[(usize, f32)], starts: &[(&Episode, usize)], states: &[f32], k: usize) -> OpenLoop {
     let width = starts[0].0.observations[0].len();
     // What follows from other numbers is not judged twice.
     let mut squares = vec![0.0; starts.len()];
@@ -105,21 +105,21 @@ fn judge(foreseen: &[(usize, f32)], starts: &[(&Trace, usize)], states: &[f32], 
     let mut judged = Vec::new();
     let mut log_units = 0.0;
     for &(i, typical) in foreseen {
-        let displacement = |(trace, t): &(&Trace, usize)| {
-            f64::from(trace.observations[t + k][i]) - f64::from(trace.observations[*t][i])
+        let displacement = |(episode, t): &(&Episode, usize)| {
+            f64::from(episode.observations[t + k][i]) - f64::from(episode.observations[*t][i])
         };
         let unit = deviation(starts.iter().map(displacement));
         if unit < STILL * f64::from(typical) {
             continue;
         }
         numbers += 1;
-        for (s, (trace, t)) in starts.iter().enumerate() {
+        for (s, (episode, t)) in starts.iter().enumerate() {
             let particles = states.chunks_exact(width).skip(s).step_by(starts.len()).map(|state| f64::from(state[i]));
             let count = states.len() / width / starts.len();
             let mean = particles.clone().sum::<f64>() / count as f64;
-            let outcome = f64::from(trace.observations[t + k][i]);
+            let outcome = f64::from(episode.observations[t + k][i]);
             squares[s] += ((mean - outcome) / unit).powi(2);
-            judged.push(Judged { mean, deviation: deviation(particles).max(1e-9), outcome });
+            judged.push(GaussianForecast { mean, deviation: deviation(particles).max(1e-9), outcome });
             log_units += unit.ln();
         }
     }
@@ -130,7 +130,7 @@ fn judge(foreseen: &[(usize, f32)], starts: &[(&Trace, usize)], states: &[f32], 
     OpenLoop {
         horizon: k,
         rmse: quantile(0.5),
-        nll: (judged.iter().map(Judged::nll).sum::<f64>() - log_units) / count,
+        nll: (judged.iter().map(GaussianForecast::nll).sum::<f64>() - log_units) / count,
         coverage90: coverage(&judged, 0.9),
         rmse_p90: quantile(0.9),
     }

@@ -69,7 +69,7 @@ pub enum Risk {
     /// Mean minus so many standard deviations; a negative number seeks risk.
     Deviation(f32),
     /// The mean of the worst share.
-    Worst(f32),
+    Cvar(f32),
     /// `-ln(mean(exp(-theta r))) / theta`: the larger theta, the more the worst counts.
     Entropic(f32),
 }
@@ -84,7 +84,7 @@ impl Risk {
             Risk::Deviation(weight) => {
                 mean - weight * (returns.iter().map(|r| (r - mean).powi(2)).sum::<f32>() / n).sqrt()
             }
-            Risk::Worst(share) => {
+            Risk::Cvar(share) => {
                 let count = ((share * n).ceil() as usize).clamp(1, returns.len());
                 let mut sorted = returns.to_vec();
                 sorted.sort_by(f32::total_cmp);
@@ -145,7 +145,7 @@ mod tests {
         for (risk, expected) in [
             (Risk::Neutral, 8.65),
             (Risk::Deviation(0.5), 6.307_325),
-            (Risk::Worst(0.2), 1.5),
+            (Risk::Cvar(0.2), 1.5),
             (Risk::Entropic(0.5), -0.405_725_28),
         ] {
             let found = risk.of(&returns);

@@ -17,7 +17,7 @@ use crate::nn::{Tensor3, tensor, values};
 /// And ways are seen once more, and told once more, through a tanh, which shows as large what is small: a centimetre
 /// decides between a hand that touches and one that does not.
 #[derive(Clone, Debug)]
-pub struct View {
+pub struct LatentFeatures {
     centre: Vec<f32>,
     scale: Vec<f32>,
     /// The numbers that have a course of their own.
@@ -32,7 +32,7 @@ pub struct View {
     cubes: Vec<Cube>,
 }
 
-impl View {
+impl LatentFeatures {
     /// The view of a world's observations.
     pub fn new(spec: &Spec) -> Self {
         let features = &spec.observation;
@@ -48,7 +48,7 @@ impl View {
                 found.push([minuend, subtrahend, i]);
             }
         }
-        let lively: Vec<usize> = (0..features.len()).filter(|i| features[*i].role == Role::State).collect();
+        let lively: Vec<usize> = (0..features.len()).filter(|i| features[*i].role == Role::Dynamic).collect();
         Self {
             cubes: Cube::find(spec, &lively),
             centre: features.iter().map(|feature| feature.centre).collect(),
@@ -74,7 +74,7 @@ impl View {
         for obs in obs.chunks_exact(size) {
             row.clear();
             row.extend_from_slice(obs);
-            self.cubes.iter().for_each(|cube| cube.rename(cube.upright(obs), &mut row));
+            self.cubes.iter().for_each(|cube| cube.rename(cube.canonicalize(obs), &mut row));
             let scaled = |i: &usize| (row[*i] - self.centre[*i]) / self.scale[*i];
             seen.extend(self.seen.iter().map(|i| symlog(scaled(i))));
             seen.extend(self.near.iter().map(|i| tanh(NEAR * scaled(i))));
@@ -116,8 +116,8 @@ mod tests {
         for task in Task::ALL {
             let mut world = task.make();
             let mut obs = world.reset(3);
-            let view = View::new(world.spec());
-            view.cubes.iter().for_each(|cube| cube.rename(cube.upright(&obs), &mut obs));
+            let view = LatentFeatures::new(world.spec());
+            view.cubes.iter().for_each(|cube| cube.rename(cube.canonicalize(&obs), &mut obs));
             let seen = view.seen(&device(), &[obs.clone(), obs.clone()].concat());
             assert_eq!(*seen.shape(), (1, 2, view.width()));
             let told = view.told(&seen);
@@ -126,7 +126,7 @@ mod tests {
                 assert!((told - obs).abs() < 1e-4 * scale, "{} {i}: {told}, not {obs}", task.name());
             }
         }
-        let push = View::new(Task::Push.make().spec());
+        let push = LatentFeatures::new(Task::Push.make().spec());
         assert_eq!(push.found.len(), 6, "cube and goal are found again from the ways there");
     }
 }

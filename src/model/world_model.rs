@@ -5,19 +5,19 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use super::open_loop::{Foresee, Trace, actions_from};
+use super::open_loop::{Episode, OpenLoopModel, actions_from};
 use super::rssm::{Latent, Rssm, RssmConfig, layers_of};
-use super::view::View;
+use super::view::LatentFeatures;
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::categorical::Side;
 use crate::nn::kernels::{sigmoid, softplus};
 use crate::nn::ops::{self, mean, record};
-use crate::nn::{Adam, Learning, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
-use crate::replay::Sequences;
+use crate::nn::{Adam, Grad, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
+use crate::replay::SequenceBatch;
 use crate::rng::Rng;
 
-/// Futures of each start when the model is judged.
+/// ImaginedReturns of each start when the model is judged.
 const PARTICLES: usize = 8;
 /// When it is judged, the model has looked at so many moments before it closes its eyes, if there were so many.
 const CONTEXT: usize = 16;
@@ -94,7 +94,7 @@ impl WorldModelConfig {
 pub struct WorldModel {
     config: WorldModelConfig,
     cpu: Cpu,
-    view: View,
+    view: LatentFeatures,
     bins: SymexpBins,
     encoder: Mlp,
     rssm: Rssm,
@@ -106,8 +106,8 @@ pub struct WorldModel {
 parameters_of_fields!(WorldModel: encoder, rssm, decoder, reward, continues);
 
 /// What a world model says of a batch of experience, and how wrong it was.
-pub struct Lesson {
-    /// What it believed at each moment, rows as in [`Sequences`].
+pub struct WorldModelLoss {
+    /// What it believed at each moment, rows as in [`SequenceBatch`].
     pub latent: Latent,
     /// The features of those beliefs, on the way of the gradients: `[1, length x sequences, features]`.
     pub features: Tensor3,
@@ -123,7 +123,7 @@ impl WorldModel {
         let cpu = device();
         let hidden = vec![config.units; config.layers];
         let features = config.rssm.features();
-        let view = View::new(spec);
+        let view = LatentFeatures::new(spec);
         let mut mlp = |input, hidden: &[usize], output| layers_of(&cpu, input, hidden, output, rng);
         let encoder = mlp(view.width(), &hidden, None);
         let decoder = mlp(features, &hidden, Some(view.width()));
@@ -164,7 +164,7 @@ impl WorldModel {
 
     /// What is believed after `action` (`[1, rows, actions]`) has led to `obs`, in rows.
     pub fn observe(&self, before: &Latent, action: &Tensor3, obs: &[f32], rng: &mut Rng) -> Latent {
-        let token = self.encoder.forward(self.view.seen(&self.cpu, obs), Learning::Frozen);
+        let token = self.encoder.forward(self.view.seen(&self.cpu, obs), Grad::Input);
         self.rssm.observe(&mut NoneTape, before, action, &token, rng).0
     }
 
@@ -175,34 +175,34 @@ impl WorldModel {
 
     /// The observations that go with features, in physical units, row by row.
     pub fn decode(&self, features: &Tensor3) -> Vec<f32> {
-        self.view.told(&self.decoder.forward(features.clone(), Learning::Frozen))
+        self.view.told(&self.decoder.forward(features.clone(), Grad::Input))
     }
 
     /// The rewards for having arrived where the features say.
     pub fn rewards(&self, features: &Tensor3) -> Vec<f32> {
-        self.bins.read(&self.reward.forward(features.clone(), Learning::Frozen))
+        self.bins.read(&self.reward.forward(features.clone(), Grad::Input))
     }
 
     /// How much the future counts there: the chance that the episode goes on, times the discount.
     pub fn continues(&self, features: &Tensor3) -> Vec<f32> {
-        let logits = self.continues.forward(features.clone(), Learning::Frozen);
+        let logits = self.continues.forward(features.clone(), Grad::Input);
         values(&logits).iter().map(|logit| sigmoid(*logit)).collect()
     }
 
     /// How wrong the model is about a batch of experience; everything is recorded on `tape`.
-    pub fn lesson<T: Tape<f32, Cpu>>(&self, tape: &mut T, batch: &Sequences, rng: &mut Rng) -> Lesson {
+    pub fn loss<T: Tape<f32, Cpu>>(&self, tape: &mut T, batch: &SequenceBatch, rng: &mut Rng) -> WorldModelLoss {
         let seen = self.view.seen(&self.cpu, &batch.obs);
-        let (latent, logits) = self.follow(tape, batch, &seen, rng);
-        let expected = self.rssm.expect(tape, &latent.memory);
-        let features = record(tape, &latent.memory, |memory| ops::join(memory, latent.state.clone()));
+        let (latent, logits) = self.observe_sequence(tape, batch, &seen, rng);
+        let expected = self.rssm.prior(tape, &latent.deter);
+        let features = record(tape, &latent.deter, |memory| ops::join(memory, latent.stoch.clone()));
 
-        let told = record(tape, &features, |features| self.decoder.forward(features, Learning::Trained));
+        let told = record(tape, &features, |features| self.decoder.forward(features, Grad::Both));
         let reconstruction = record(tape, &told, |told| ops::squared_distance(told, &seen));
         let reward = record(tape, &features, |features| {
-            self.bins.loss(self.reward.forward(features, Learning::Trained), &[&batch.rewards])
+            self.bins.loss(self.reward.forward(features, Grad::Both), &[&batch.rewards])
         });
         let continues = record(tape, &features, |features| {
-            let logits = self.continues.forward(features, Learning::Trained);
+            let logits = self.continues.forward(features, Grad::Both);
             ops::rowwise(logits, |row, logit, slope| {
                 let target = if batch.terminal[row] { 0.0 } else { self.config.discount() };
                 slope[0] = sigmoid(logit[0]) - target;
@@ -218,7 +218,7 @@ impl WorldModel {
             let entropies = categorical.entropies(logits);
             entropies.iter().sum::<f32>() / entropies.len() as f32
         };
-        Lesson {
+        WorldModelLoss {
             entropies: [mean_entropy(&logits), mean_entropy(&expected)],
             losses: vec![
                 ("reconstruction", self.config.reconstruction, reconstruction),
@@ -233,30 +233,30 @@ impl WorldModel {
     }
 
     /// One step of learning by itself, without actor and critic. Returns the mean of each loss.
-    pub fn learn(&mut self, batch: &Sequences, optimiser: &mut Adam, rng: &mut Rng) -> Vec<(&'static str, f32)> {
+    pub fn learn(&mut self, batch: &SequenceBatch, optimiser: &mut Adam, rng: &mut Rng) -> Vec<(&'static str, f32)> {
         let mut tape = OwnedTape::default();
-        let lesson = self.lesson(&mut tape, batch, rng);
-        let means = lesson.losses.iter().map(|(name, _, loss)| (*name, mean(loss))).collect();
-        let losses: Vec<_> = lesson.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
+        let loss = self.loss(&mut tape, batch, rng);
+        let means = loss.losses.iter().map(|(name, _, loss)| (*name, mean(loss))).collect();
+        let losses: Vec<_> = loss.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
         optimiser.step(self, &mut ops::total(tape, &losses).backward());
         means
     }
 
     /// What is believed at each moment of a batch, moments one after the other, and the posterior's logits.
-    fn follow<T: Tape<f32, Cpu>>(
+    fn observe_sequence<T: Tape<f32, Cpu>>(
         &self,
         tape: &mut T,
-        batch: &Sequences,
+        batch: &SequenceBatch,
         seen: &Tensor3,
         rng: &mut Rng,
     ) -> (Latent, Tensor3) {
         let rows = batch.sequences;
-        let tokens = record(tape, seen, |seen| self.encoder.forward(seen, Learning::FromData));
+        let tokens = record(tape, seen, |seen| self.encoder.forward(seen, Grad::Params));
         let width = batch.actions.len() / (rows * batch.length);
         let mut latent = self.rssm.initial(rows);
         // What led to a moment was done at the one before.
         let mut action = vec![0.0; rows * width];
-        let (mut memories, mut states, mut all_logits) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut deters, mut stochs, mut all_logits) = (Vec::new(), Vec::new(), Vec::new());
         for t in 0..batch.length {
             let first = &batch.first[t * rows..][..rows];
             if t > 0 && first.contains(&true) {
@@ -269,8 +269,8 @@ impl WorldModel {
             let done = tensor(&self.cpu, std::mem::take(&mut action), (1, rows, width));
             let token = record(tape, &tokens, |tokens| ops::rows(tokens, t * rows, rows));
             let (next, logits) = self.rssm.observe(tape, &latent, &done, &token, rng);
-            memories.push(next.memory.clone());
-            states.push(next.state.clone());
+            deters.push(next.deter.clone());
+            stochs.push(next.stoch.clone());
             all_logits.push(logits);
             latent = next;
             action = batch.actions[t * rows * width..][..rows * width].iter().map(|a| a.clamp(-1.0, 1.0)).collect();
@@ -280,18 +280,18 @@ impl WorldModel {
             *tape = recorded;
             stacked
         };
-        (Latent { memory: stack(&memories), state: stack(&states) }, stack(&all_logits))
+        (Latent { deter: stack(&deters), stoch: stack(&stochs) }, stack(&all_logits))
     }
 }
 
-impl Foresee for WorldModel {
-    fn foreseen(&self) -> Vec<(usize, f32)> {
+impl OpenLoopModel for WorldModel {
+    fn predicted(&self) -> Vec<(usize, f32)> {
         self.view.lively()
     }
 
-    fn futures(&self, starts: &[(&Trace, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
         // Each particle looks back on its own: what is believed is drawn too.
-        let rows: Vec<(&Trace, usize)> = starts.repeat(PARTICLES);
+        let rows: Vec<(&Episode, usize)> = starts.repeat(PARTICLES);
         let width = starts[0].0.actions[0].len();
         let mut latent = self.initial(rows.len());
         for back in (0..CONTEXT).rev() {
@@ -299,13 +299,15 @@ impl Foresee for WorldModel {
             let begun = |t: usize| t.checked_sub(back);
             let keep: Vec<f32> = rows.iter().map(|(_, t)| f32::from(begun(*t).is_some_and(|now| now > 0))).collect();
             let before = latent.masked(&mut NoneTape, &keep);
-            let actions = rows.iter().flat_map(|(trace, t)| match begun(*t) {
-                Some(now) if now > 0 => trace.actions[now - 1].clone(),
+            let actions = rows.iter().flat_map(|(episode, t)| match begun(*t) {
+                Some(now) if now > 0 => episode.actions[now - 1].clone(),
                 _ => vec![0.0; width],
             });
             let actions = tensor(&self.cpu, actions.collect(), (1, rows.len(), width));
-            let obs: Vec<f32> =
-                rows.iter().flat_map(|(trace, t)| trace.observations[begun(*t).unwrap_or(0)].iter().copied()).collect();
+            let obs: Vec<f32> = rows
+                .iter()
+                .flat_map(|(episode, t)| episode.observations[begun(*t).unwrap_or(0)].iter().copied())
+                .collect();
             latent = self.observe(&before, &actions, &obs, rng);
         }
         let actions: Vec<Vec<f32>> = rows.iter().map(|start| actions_from(*start, ahead).collect()).collect();

@@ -4,7 +4,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use super::ops::{self, Learning, Tensor3, values, values_mut};
+use super::ops::{self, Grad, Tensor3, values, values_mut};
 use super::parameters::Parameters;
 use super::{Activation, norm};
 use crate::rng::{self, Rng};
@@ -160,12 +160,12 @@ impl Mlp {
     }
 
     /// The outputs for `x` (`[members or 1, batch, input]`).
-    pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Learning) -> Tensor3<T> {
+    pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Grad) -> Tensor3<T> {
         self.layers.iter().enumerate().fold(x, |x, (i, Layer { weight, bias, norm, activation })| {
             // Beyond the first layer, the input is no data.
-            let within = if i > 0 && learning == Learning::FromData { Learning::Trained } else { learning };
+            let within = if i > 0 && learning == Grad::Params { Grad::Both } else { learning };
             let affine = |x, activation| ops::dense(x, weight, bias, activation, within);
-            let inside = if learning == Learning::Frozen { learning } else { Learning::Trained };
+            let inside = if learning == Grad::Input { learning } else { Grad::Both };
             match norm {
                 NormParameters::None => affine(x, *activation),
                 NormParameters::Layer { gain, shift } => {

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::Parameters;
 use super::kernels::{self, vectorised_fn};
-use super::ops::{Learning, Tensor3, take, values};
+use super::ops::{Grad, Tensor3, take, values};
 
 /// Weight of the penalty that draws learned bounds together.
 const BOUND_PENALTY: f32 = 0.01;
@@ -67,7 +67,7 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
     targets: &Tensor3,
     bounds: &LogVarianceBounds,
     beta: f32,
-    learning: Learning,
+    learning: Grad,
 ) -> Tensor3<T> {
     let (head, mut tape) = head.split_tape();
     let &(_, batch, width) = head.shape();
@@ -93,7 +93,7 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
     let [losses, mut d_max, mut d_min]: [Vec<f32>; 3] =
         std::array::from_fn(|k| (0..outputs).map(|i| of_networks.iter().map(|sums| sums[k][i]).sum()).collect());
     let mut loss = losses.iter().map(|loss| f64::from(*loss)).sum::<f64>();
-    if learning == Learning::Trained {
+    if learning == Grad::Both {
         loss += f64::from(BOUND_PENALTY * maxima.iter().zip(minima).map(|(max, min)| max - min).sum::<f32>());
         d_max.iter_mut().for_each(|d| *d += BOUND_PENALTY);
         d_min.iter_mut().for_each(|d| *d -= BOUND_PENALTY);
@@ -105,7 +105,7 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
         tape.add_backward_op(move |gradients| {
             let scale = take(gradients, &loss)?[0];
             let mut parts = vec![(&head, &d_head)];
-            if learning == Learning::Trained {
+            if learning == Grad::Both {
                 parts.extend([(&max, &d_max), (&min, &d_min)]);
             }
             for (of, d) in parts {
@@ -187,9 +187,9 @@ mod tests {
         let head = tensor(&cpu, vec![0.1, -0.2, -1.0, 0.3, 0.4, 0.0, -4.0, 1.0], (1, 2, 4));
         let targets = tensor(&cpu, vec![0.0, 0.1, 0.5, -0.6], (1, 2, 2));
         let bounds = LogVarianceBounds::new(&cpu, 2);
-        let frozen = bounded_nll(head.clone(), &targets, &bounds, 0.0, Learning::Frozen);
+        let frozen = bounded_nll(head.clone(), &targets, &bounds, 0.0, Grad::Input);
         near(values(&frozen), &[-1.106_495_37]);
-        let loss = bounded_nll(head.leaky_trace(), &targets, &bounds, 0.0, Learning::Trained);
+        let loss = bounded_nll(head.leaky_trace(), &targets, &bounds, 0.0, Grad::Both);
         near(values(&loss), &[-0.896_495_37]);
         let mut gradients = loss.sum().backward();
         near(

@@ -27,7 +27,7 @@ pub use kernels::Activation;
 pub use layers::{Init, Mlp, MlpConfig, Norm};
 pub(crate) use likelihood::bounded_variance;
 pub use likelihood::{LogVarianceBounds, bounded, bounded_nll};
-pub use ops::{Learning, Tensor2, Tensor3, values, values_mut};
+pub use ops::{Grad, Tensor2, Tensor3, values, values_mut};
 pub(crate) use parameters::parameters_of_fields;
 pub use parameters::{Parameters, copy_parameters, polyak};
 pub use recurrent::BlockDense;

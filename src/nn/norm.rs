@@ -4,7 +4,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
 use super::kernels::{Activation, silu, silu_slope, vectorised_fn};
-use super::ops::{Learning, Tensor3, take, values};
+use super::ops::{Grad, Tensor3, take, values};
 use super::parameters::Parameters;
 
 /// Layer normalisation (Ba et al. 2016), then the activation:
@@ -14,7 +14,7 @@ pub fn layer_norm<T: Tape<f32, Cpu>>(
     gain: &Tensor3,
     shift: &Tensor3,
     activation: Activation,
-    learning: Learning,
+    learning: Grad,
 ) -> Tensor3<T> {
     normalised(x, gain, Some(shift), Rule { centred: true, epsilon: 1e-5, activation }, learning)
 }
@@ -25,7 +25,7 @@ pub fn rms_norm<T: Tape<f32, Cpu>>(
     x: Tensor3<T>,
     gain: &Tensor3,
     activation: Activation,
-    learning: Learning,
+    learning: Grad,
 ) -> Tensor3<T> {
     normalised(x, gain, None, Rule { centred: false, epsilon: 1e-4, activation }, learning)
 }
@@ -44,7 +44,7 @@ impl RmsNorm {
 
     /// The output for `x` `[1, batch, features]`.
     pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>) -> Tensor3<T> {
-        rms_norm(x, &self.gain, Activation::Silu, Learning::Trained)
+        rms_norm(x, &self.gain, Activation::Silu, Grad::Both)
     }
 }
 
@@ -72,7 +72,7 @@ fn normalised<T: Tape<f32, Cpu>>(
     gain: &Tensor3,
     shift: Option<&Tensor3>,
     rule: Rule,
-    learning: Learning,
+    learning: Grad,
 ) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(members, batch, features) = x.shape();
@@ -108,7 +108,7 @@ fn normalised<T: Tape<f32, Cpu>>(
                 let own = member * features..(member + 1) * features;
                 backward(
                     dx,
-                    if learning == Learning::Frozen { &mut [] } else { &mut d_gain[own.clone()] },
+                    if learning == Grad::Input { &mut [] } else { &mut d_gain[own.clone()] },
                     &mut d_shift[own],
                     &dy[rows.clone()],
                     &values(&x)[rows],
@@ -120,7 +120,7 @@ fn normalised<T: Tape<f32, Cpu>>(
             }
             **gradients.get_or_alloc_mut(&gain)? = d_gain;
             if let Some(shift) = &shift
-                && learning != Learning::Frozen
+                && learning != Grad::Input
             {
                 **gradients.get_or_alloc_mut(shift)? = d_shift;
             }

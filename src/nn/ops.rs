@@ -56,13 +56,13 @@ pub(crate) fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<
 
 /// Where an operation's gradients flow to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Learning {
+pub enum Grad {
     /// Gradients flow into the parameters and through to the input.
-    Trained,
+    Both,
     /// Gradients flow into the parameters only: the input is data, and nobody asks for its gradient.
-    FromData,
+    Params,
     /// Gradients flow through to the input only.
-    Frozen,
+    Input,
 }
 
 /// `activation(x w + b)`: x `[members or 1, batch, input]`, w `[members, input, output]`,
@@ -72,7 +72,7 @@ pub fn dense<T: Tape<f32, Cpu>>(
     w: &Tensor3,
     b: &Tensor3,
     activation: Activation,
-    learning: Learning,
+    learning: Grad,
 ) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(x_members, batch, input) = x.shape();
@@ -94,7 +94,7 @@ pub fn dense<T: Tape<f32, Cpu>>(
             let mut dz = take(gradients, &y)?;
             kernels::through_activation(&mut dz, before.as_deref().unwrap_or(values(&y)), activation);
             // Both at once: neither waits for the other's last task.
-            let (to_parameters, to_input) = (learning != Learning::Frozen, learning != Learning::FromData);
+            let (to_parameters, to_input) = (learning != Grad::Input, learning != Grad::Params);
             let mut of_parameters =
                 to_parameters.then(|| Ok((take(gradients, &w)?, take(gradients, &b)?))).transpose()?;
             let mut of_input = to_input.then(|| take(gradients, &x)).transpose()?;

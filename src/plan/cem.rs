@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, as_actions, best, refit, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, refit, shifted};
 use crate::rng::{self, Rng};
 
 /// Variance of the search at the start of every plan: (upper - lower)^2 / 16.
@@ -17,7 +17,7 @@ const CONVERGED: f64 = 1e-3;
 pub struct CemConfig {
     /// Steps that it looks ahead.
     pub horizon: usize,
-    /// Sequences tried in an iteration.
+    /// ActionSequences tried in an iteration.
     pub population: usize,
     /// The best of them, which shape the next iteration.
     pub elites: usize,
@@ -54,16 +54,16 @@ impl Planner for Cem {
         self.mean.fill(0.0);
     }
 
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let CemConfig { horizon, population, elites, iterations, momentum } = self.config;
         let mut variance = vec![START_VARIANCE; self.mean.len()];
-        let mut promised = f32::NEG_INFINITY;
+        let mut best_return = f32::NEG_INFINITY;
         for index in 0..iterations {
             if variance.iter().all(|v| *v < CONVERGED) {
                 break;
             }
             // Sample.
-            let mut candidates = Sequences::new(horizon, self.actions);
+            let mut candidates = ActionSequences::new(horizon, self.actions);
             for _ in 0..population {
                 let row = self.mean.iter().zip(&variance);
                 candidates
@@ -74,12 +74,12 @@ impl Planner for Cem {
             let returns = objective.returns(&candidates);
             // Refit.
             let order = best(&returns, elites);
-            promised = promised.max(returns[order[0]]);
+            best_return = best_return.max(returns[order[0]]);
             let elites: Vec<&[f32]> = order.iter().map(|&i| candidates.row(i)).collect();
             refit(&mut self.mean, &mut variance, &elites, momentum);
             observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &self.mean });
         }
-        Plan { actions: as_actions(&self.mean), promised }
+        Plan { actions: as_actions(&self.mean), best_return }
     }
 
     fn shift(&mut self, steps: usize) {

@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::noise::ColoredNoise;
-use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, best, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted};
 use crate::rng::Rng;
 
 /// Settings of [`Gradient`].
@@ -15,7 +15,7 @@ use crate::rng::Rng;
 pub struct GradientConfig {
     /// Steps that it looks ahead.
     pub horizon: usize,
-    /// Sequences that climb side by side: the plan before, and random ones.
+    /// ActionSequences that climb side by side: the plan before, and random ones.
     pub starts: usize,
     /// Steps of ascent.
     pub iterations: usize,
@@ -26,12 +26,12 @@ pub struct GradientConfig {
     /// Standard deviation of the random starts, and the exponent of their noise.
     pub deviation: f64,
     /// See [`ColoredNoise`].
-    pub colour: f64,
+    pub noise_beta: f64,
 }
 
 impl Default for GradientConfig {
     fn default() -> Self {
-        Self { horizon: 15, starts: 8, iterations: 20, rate: 0.1, max_norm: 10.0, deviation: 0.5, colour: 2.0 }
+        Self { horizon: 15, starts: 8, iterations: 20, rate: 0.1, max_norm: 10.0, deviation: 0.5, noise_beta: 2.0 }
     }
 }
 
@@ -47,7 +47,7 @@ pub struct Gradient {
 impl Gradient {
     /// For actions of so many numbers.
     pub fn new(config: GradientConfig, actions: usize) -> Self {
-        let noise = ColoredNoise::new(config.colour, config.horizon);
+        let noise = ColoredNoise::new(config.noise_beta, config.horizon);
         Self { before: vec![0.0; config.horizon * actions], noise, actions, config }
     }
 }
@@ -57,9 +57,9 @@ impl Planner for Gradient {
         self.before.fill(0.0);
     }
 
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let GradientConfig { horizon, starts, deviation, .. } = self.config;
-        let mut sequences = Sequences::new(horizon, self.actions);
+        let mut sequences = ActionSequences::new(horizon, self.actions);
         sequences.values.extend(self.before.iter().map(|a| *a as f32));
         for _ in 1..starts {
             let noise = self.noise.sample_actions(self.actions, rng);
@@ -79,19 +79,19 @@ impl Planner for Gradient {
 /// Climbs from the given sequences by Adam, within the bounds; the best of where they arrive, and of what was best on the
 /// way.
 pub(super) fn ascend(
-    mut sequences: Sequences,
+    mut sequences: ActionSequences,
     config: &GradientConfig,
     objective: &mut dyn Objective,
-    observer: &mut Observer,
+    observer: &mut PlanObserver,
 ) -> Plan {
     let width = sequences.width();
     let mut moments = vec![[0.0; 2]; sequences.values.len()];
-    let mut plan = Plan { actions: sequences.row(0).to_vec(), promised: f32::NEG_INFINITY };
+    let mut plan = Plan { actions: sequences.row(0).to_vec(), best_return: f32::NEG_INFINITY };
     for index in 0..config.iterations {
         let (returns, gradients) = objective.gradients(&sequences);
         let winner = best(&returns, 1)[0];
-        if returns[winner] > plan.promised {
-            plan = Plan { actions: sequences.row(winner).to_vec(), promised: returns[winner] };
+        if returns[winner] > plan.best_return {
+            plan = Plan { actions: sequences.row(winner).to_vec(), best_return: returns[winner] };
         }
         let mean: Vec<f64> = plan.actions.iter().map(|a| f64::from(*a)).collect();
         observer(&Iteration { index, candidates: &sequences, returns: &returns, mean: &mean });
@@ -117,5 +117,5 @@ pub(super) fn ascend(
     sequences.values.extend(plan.actions);
     let returns = objective.returns(&sequences);
     let winner = best(&returns, 1)[0];
-    Plan { actions: sequences.row(winner).to_vec(), promised: returns[winner] }
+    Plan { actions: sequences.row(winner).to_vec(), best_return: returns[winner] }
 }

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::gradient::ascend;
-use super::{GradientConfig, Icem, IcemConfig, Objective, Observer, Plan, Planner, Sequences};
+use super::{ActionSequences, GradientConfig, Icem, IcemConfig, Objective, Plan, PlanObserver, Planner};
 use crate::rng::Rng;
 
 /// Settings of [`Hybrid`].
@@ -46,15 +46,16 @@ impl Planner for Hybrid {
         self.icem.reset();
     }
 
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let found = self.icem.plan(objective, observer, rng);
-        let sequence = |values: Vec<f32>| Sequences { horizon: self.ascent.horizon, actions: self.actions, values };
+        let sequence =
+            |values: Vec<f32>| ActionSequences { horizon: self.ascent.horizon, actions: self.actions, values };
         let climbed = ascend(sequence(found.actions.clone()), &self.ascent, objective, observer);
         // Both again, under the same luck.
         let returns = objective.returns(&sequence([found.actions.clone(), climbed.actions.clone()].concat()));
         if returns[1] > returns[0] {
             self.icem.adopt(&climbed.actions);
-            return Plan { promised: returns[1], ..climbed };
+            return Plan { best_return: returns[1], ..climbed };
         }
         found
     }

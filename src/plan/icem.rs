@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::noise::ColoredNoise;
-use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, as_actions, best, refit, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, refit, shifted};
 use crate::rng::Rng;
 
 /// Settings of [`Icem`].
@@ -16,7 +16,7 @@ use crate::rng::Rng;
 pub struct IcemConfig {
     /// Steps that it looks ahead.
     pub horizon: usize,
-    /// Sequences tried in the first iteration.
+    /// ActionSequences tried in the first iteration.
     pub population: usize,
     /// Each iteration tries so many times fewer than the one before, but twice the elites at least.
     pub decay: f64,
@@ -27,7 +27,7 @@ pub struct IcemConfig {
     /// Weight of the old mean and variance.
     pub momentum: f64,
     /// Exponent of the noise: 2 to 4 for slow arms, below 1 for fast legs.
-    pub colour: f64,
+    pub noise_beta: f64,
     /// Standard deviation at the start of every plan.
     pub start_deviation: f64,
     /// Share of the elites that is kept.
@@ -46,7 +46,7 @@ impl Default for IcemConfig {
             elites: 10,
             iterations: 3,
             momentum: 0.1,
-            colour: 2.5,
+            noise_beta: 2.5,
             start_deviation: 0.5,
             kept: 0.3,
             execute_mean: false,
@@ -67,11 +67,11 @@ pub struct Icem {
 impl Icem {
     /// For actions of so many numbers.
     pub fn new(config: IcemConfig, actions: usize) -> Self {
-        let noise = ColoredNoise::new(config.colour, config.horizon);
+        let noise = ColoredNoise::new(config.noise_beta, config.horizon);
         Self { mean: vec![0.0; config.horizon * actions], elites: Vec::new(), noise, actions, config }
     }
 
-    /// Sequences tried in each iteration.
+    /// ActionSequences tried in each iteration.
     pub fn sizes(config: &IcemConfig) -> Vec<usize> {
         let next = |size: &usize| Some(((*size as f64 / config.decay) as usize).max(2 * config.elites));
         std::iter::successors(Some(config.population), next).take(config.iterations).collect()
@@ -96,15 +96,15 @@ impl Planner for Icem {
         self.elites.clear();
     }
 
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let config = self.config.clone();
         let kept = (config.kept * config.elites as f64).ceil() as usize;
         let mut variance = vec![config.start_deviation.powi(2); self.mean.len()];
-        let mut plan = Plan { actions: Vec::new(), promised: f32::NEG_INFINITY };
+        let mut plan = Plan { actions: Vec::new(), best_return: f32::NEG_INFINITY };
         let sizes = Self::sizes(&config);
         for (index, size) in sizes.iter().enumerate() {
             // Sample: fresh noise, the best of before, and at last the mean itself.
-            let mut candidates = Sequences::new(config.horizon, self.actions);
+            let mut candidates = ActionSequences::new(config.horizon, self.actions);
             for _ in 0..*size {
                 candidates.values.extend(self.sample(&variance, rng));
             }
@@ -119,7 +119,7 @@ impl Planner for Icem {
             self.elites = order.iter().map(|&i| candidates.row(i).to_vec()).collect();
             let elites: Vec<&[f32]> = self.elites.iter().map(Vec::as_slice).collect();
             refit(&mut self.mean, &mut variance, &elites, config.momentum);
-            plan = Plan { actions: self.elites[0].clone(), promised: returns[order[0]] };
+            plan = Plan { actions: self.elites[0].clone(), best_return: returns[order[0]] };
             if config.execute_mean {
                 plan.actions = as_actions(&self.mean);
             }

@@ -32,7 +32,7 @@ use crate::rng::Rng;
 
 /// A batch of action sequences, `[count, horizon, actions]`.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Sequences {
+pub struct ActionSequences {
     /// Steps in each.
     pub horizon: usize,
     /// Numbers in an action.
@@ -41,7 +41,7 @@ pub struct Sequences {
     pub values: Vec<f32>,
 }
 
-impl Sequences {
+impl ActionSequences {
     /// None yet.
     pub fn new(horizon: usize, actions: usize) -> Self {
         Self { horizon, actions, values: Vec::new() }
@@ -70,14 +70,14 @@ impl Sequences {
 /// What a planner maximises. Any closure from sequences to returns is an objective.
 pub trait Objective {
     /// What sequences are worth: one return for each. Not a number counts as worst.
-    fn returns(&mut self, sequences: &Sequences) -> Vec<f32>;
+    fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32>;
 
     /// Returns, and how they change with every number of every sequence (`[count, horizon, actions]`). Unless an
     /// objective knows better, central differences: two more returns for each number.
-    fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+    fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         const STEP: f32 = 1e-3;
         let width = sequences.width();
-        let mut around = Sequences::new(sequences.horizon, sequences.actions);
+        let mut around = ActionSequences::new(sequences.horizon, sequences.actions);
         for row in sequences.rows() {
             for (i, step) in (0..width).flat_map(|i| [(i, STEP), (i, -STEP)]) {
                 around.values.extend(row);
@@ -91,8 +91,8 @@ pub trait Objective {
     }
 }
 
-impl<F: FnMut(&Sequences) -> Vec<f32>> Objective for F {
-    fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+impl<F: FnMut(&ActionSequences) -> Vec<f32>> Objective for F {
+    fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
         self(sequences)
     }
 }
@@ -102,7 +102,7 @@ pub struct Iteration<'a> {
     /// Its number, from 0.
     pub index: usize,
     /// What was tried.
-    pub candidates: &'a Sequences,
+    pub candidates: &'a ActionSequences,
     /// What each was worth.
     pub returns: &'a [f32],
     /// The mean of the search distribution afterwards, `[horizon, actions]`.
@@ -110,7 +110,7 @@ pub struct Iteration<'a> {
 }
 
 /// Watches iterations.
-pub type Observer<'a> = dyn FnMut(&Iteration) + 'a;
+pub type PlanObserver<'a> = dyn FnMut(&Iteration) + 'a;
 
 /// What a planner proposes.
 #[derive(Clone, Debug, PartialEq)]
@@ -119,7 +119,7 @@ pub struct Plan {
     pub actions: Vec<f32>,
     /// The best return that was seen on the way: what the objective promises, rather too much than too
     /// little.
-    pub promised: f32,
+    pub best_return: f32,
 }
 
 /// A planner with its memory from step to step.
@@ -128,7 +128,7 @@ pub trait Planner: Send {
     fn reset(&mut self);
 
     /// Searches for the best sequence.
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan;
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan;
 
     /// The first `steps` actions of the plan were executed: the memory moves on with the world.
     fn shift(&mut self, steps: usize);

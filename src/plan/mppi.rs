@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, as_actions, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, shifted};
 use crate::rng::{self, Rng};
 
 /// Settings of [`Mppi`].
@@ -12,7 +12,7 @@ use crate::rng::{self, Rng};
 pub struct MppiConfig {
     /// Steps that it looks ahead.
     pub horizon: usize,
-    /// Sequences tried in an iteration.
+    /// ActionSequences tried in an iteration.
     pub population: usize,
     /// Iterations.
     pub iterations: usize,
@@ -66,15 +66,15 @@ impl Planner for Mppi {
         self.before.fill(0.0);
     }
 
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
-        let mut promised = f32::NEG_INFINITY;
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
+        let mut best_return = f32::NEG_INFINITY;
         for index in 0..self.config.iterations {
-            let mut candidates = Sequences::new(self.config.horizon, self.actions);
+            let mut candidates = ActionSequences::new(self.config.horizon, self.actions);
             for _ in 0..self.config.population {
                 candidates.values.extend(self.sample(rng));
             }
             let returns = objective.returns(&candidates);
-            promised = returns.iter().copied().fold(promised, f32::max);
+            best_return = returns.iter().copied().fold(best_return, f32::max);
             let weights = weights(&returns, self.config.temperature * spread(&returns));
             self.mean.fill(0.0);
             for (row, weight) in candidates.rows().zip(&weights) {
@@ -82,7 +82,7 @@ impl Planner for Mppi {
             }
             observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &self.mean });
         }
-        Plan { actions: as_actions(&self.mean), promised }
+        Plan { actions: as_actions(&self.mean), best_return }
     }
 
     fn shift(&mut self, steps: usize) {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Iteration, Objective, Observer, Plan, Planner, Sequences, best};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best};
 use crate::rng::{self, Rng};
 
 /// Settings of [`RandomShooting`].
@@ -11,7 +11,7 @@ use crate::rng::{self, Rng};
 pub struct ShootingConfig {
     /// Steps that it looks ahead.
     pub horizon: usize,
-    /// Sequences tried.
+    /// ActionSequences tried.
     pub population: usize,
 }
 
@@ -37,8 +37,8 @@ impl RandomShooting {
 impl Planner for RandomShooting {
     fn reset(&mut self) {}
 
-    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut Observer, rng: &mut Rng) -> Plan {
-        let mut candidates = Sequences::new(self.config.horizon, self.actions);
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
+        let mut candidates = ActionSequences::new(self.config.horizon, self.actions);
         let count = self.config.population * candidates.width();
         candidates.values = (0..count).map(|_| rng::uniform(rng, -1.0, 1.0) as f32).collect();
         let returns = objective.returns(&candidates);
@@ -46,7 +46,7 @@ impl Planner for RandomShooting {
         let actions = candidates.row(winner).to_vec();
         let mean: Vec<f64> = actions.iter().map(|a| f64::from(*a)).collect();
         observer(&Iteration { index: 0, candidates: &candidates, returns: &returns, mean: &mean });
-        Plan { actions, promised: returns[winner] }
+        Plan { actions, best_return: returns[winner] }
     }
 
     fn shift(&mut self, _steps: usize) {}

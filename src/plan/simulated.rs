@@ -3,7 +3,7 @@
 use nalgebra::SVector;
 use rayon::prelude::*;
 
-use super::{Objective, Sequences};
+use super::{ActionSequences, Objective};
 use crate::diff::derivatives::gradient;
 use crate::diff::{System, roll_out};
 
@@ -27,13 +27,13 @@ impl<'a, Y: System<N, M>, const N: usize, const M: usize> Simulated<'a, Y, N, M>
 }
 
 impl<Y: System<N, M>, const N: usize, const M: usize> Objective for Simulated<'_, Y, N, M> {
-    fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+    fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
         self.steps += sequences.count() * sequences.horizon;
         let rows = sequences.values.par_chunks_exact(sequences.horizon * M);
         rows.map(|row| -roll_out(self.system, &self.start, &Self::actions(row)).1 as f32).collect()
     }
 
-    fn gradients(&mut self, sequences: &Sequences) -> (Vec<f32>, Vec<f32>) {
+    fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         self.steps += sequences.count() * sequences.horizon;
         let rows = sequences.values.par_chunks_exact(sequences.horizon * M);
         let each = rows.map(|row| {

@@ -6,18 +6,18 @@ use serde::{Deserialize, Serialize};
 
 use super::smoothness;
 use super::statistics::{deviation, mean, wilson};
-use crate::agent::{Agent, Seat};
+use crate::agent::{Agent, Slot};
 use crate::env::vector::VectorEnv;
 use crate::env::{Env, World};
 use crate::error::{Error, Result};
-use crate::model::open_loop::Trace;
+use crate::model::open_loop::Episode;
 
 /// Worlds that are stepped side by side; agents answer for all of them in one pass.
 const WORLDS: usize = 20;
 
 /// Which starts an evaluation has. No training episode shares them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Starts {
+pub enum EvalSeeds {
     /// Those of the evaluations during training.
     Training,
     /// Those of the test at the end: never seen before.
@@ -26,20 +26,20 @@ pub enum Starts {
     Seed(u64),
 }
 
-impl Starts {
+impl EvalSeeds {
     fn seed(self, episode: usize) -> u64 {
         let base = match self {
-            Starts::Training => 1 << 40,
-            Starts::Test => 2 << 40,
-            Starts::Seed(seed) => (3 << 40) + (seed << 20),
+            EvalSeeds::Training => 1 << 40,
+            EvalSeeds::Test => 2 << 40,
+            EvalSeeds::Seed(seed) => (3 << 40) + (seed << 20),
         };
         base + episode as u64
     }
 }
 
-/// One judged episode.
+/// What came of one episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Episode {
+pub struct EpisodeResult {
     /// Sum of rewards.
     #[serde(rename = "return")]
     pub total: f64,
@@ -59,12 +59,13 @@ pub struct Episode {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
     /// The episodes, in the order of their starts.
-    pub episodes: Vec<Episode>,
+    #[serde(rename = "episodes")]
+    pub results: Vec<EpisodeResult>,
     /// Time to choose one action at the start of an episode, ms, when asked for one at a time.
     pub action_ms: f64,
     /// The episodes themselves, for those who judge models by them; not kept on disk.
     #[serde(skip)]
-    pub traces: Vec<Trace>,
+    pub episodes: Vec<Episode>,
 }
 
 /// The numbers of an [`Evaluation`], as they stand in tables.
@@ -93,30 +94,30 @@ pub struct Summary {
 impl Evaluation {
     /// The evaluation in numbers.
     pub fn summary(&self) -> Summary {
-        let successes = self.episodes.iter().filter(|episode| episode.success).count();
-        let [success_low, success_high] = wilson(successes, self.episodes.len());
-        let returns: Vec<f64> = self.episodes.iter().map(|episode| episode.total).collect();
+        let successes = self.results.iter().filter(|result| result.success).count();
+        let [success_low, success_high] = wilson(successes, self.results.len());
+        let returns: Vec<f64> = self.results.iter().map(|result| result.total).collect();
         let mean_of = |values: Vec<f64>| (!values.is_empty()).then(|| mean(&values));
         Summary {
-            episodes: self.episodes.len(),
-            success: successes as f64 / self.episodes.len() as f64,
+            episodes: self.results.len(),
+            success: successes as f64 / self.results.len() as f64,
             success_low,
             success_high,
             return_mean: mean(&returns),
             return_std: deviation(&returns),
-            smoothness_sparc: mean_of(self.episodes.iter().filter_map(|episode| episode.sparc).collect()),
-            smoothness_ldlj: mean_of(self.episodes.iter().filter_map(|episode| episode.ldlj).collect()),
+            smoothness_sparc: mean_of(self.results.iter().filter_map(|result| result.sparc).collect()),
+            smoothness_ldlj: mean_of(self.results.iter().filter_map(|result| result.ldlj).collect()),
             action_ms: self.action_ms,
         }
     }
 }
 
 /// Worlds of one kind, kept for many evaluations.
-pub struct Judge {
+pub struct Evaluator {
     worlds: VectorEnv<World>,
 }
 
-impl Judge {
+impl Evaluator {
     /// A judge with worlds made by `make`.
     ///
     /// # Errors
@@ -130,9 +131,9 @@ impl Judge {
     ///
     /// # Errors
     /// If there are no episodes, or the agent's actions cannot be taken.
-    pub fn evaluate(&mut self, agent: &mut dyn Agent, episodes: usize, starts: Starts) -> Result<Evaluation> {
+    pub fn evaluate(&mut self, agent: &mut dyn Agent, episodes: usize, starts: EvalSeeds) -> Result<Evaluation> {
         let mut evaluation = Evaluation::default();
-        while !self.go_on(&mut evaluation, agent, episodes, starts)? {}
+        while !self.next_batch(&mut evaluation, agent, episodes, starts)? {}
         Ok(evaluation)
     }
 
@@ -140,23 +141,23 @@ impl Judge {
     /// these were the last: for whoever wants to see, or to keep, what there is before the end.
     ///
     /// # Errors
-    /// As for [`Judge::evaluate`].
-    pub fn go_on(
+    /// As for [`Evaluator::evaluate`].
+    pub fn next_batch(
         &mut self,
         evaluation: &mut Evaluation,
         agent: &mut dyn Agent,
         episodes: usize,
-        starts: Starts,
+        starts: EvalSeeds,
     ) -> Result<bool> {
         if episodes == 0 {
             return Err(Error::BadSetting("an evaluation needs at least one episode".into()));
         }
-        let done = evaluation.episodes.len();
+        let done = evaluation.results.len();
         let seeds: Vec<u64> = (done..episodes.min(done + WORLDS)).map(|i| starts.seed(i)).collect();
         if !seeds.is_empty() {
             self.side_by_side(evaluation, agent, &seeds)?;
         }
-        Ok(evaluation.episodes.len() >= episodes)
+        Ok(evaluation.results.len() >= episodes)
     }
 
     fn side_by_side(&mut self, evaluation: &mut Evaluation, agent: &mut dyn Agent, seeds: &[u64]) -> Result<()> {
@@ -164,58 +165,58 @@ impl Judge {
         let mut observations = self.worlds.reset(seeds);
         let mut paths: Vec<Vec<[f64; 3]>> =
             self.worlds.envs().iter().take(seeds.len()).map(|world| world.hand().into_iter().collect()).collect();
-        let blank = Episode { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
-        let mut episodes = vec![blank; seeds.len()];
+        let blank = EpisodeResult { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
+        let mut results = vec![blank; seeds.len()];
         let mut running: Vec<usize> = (0..seeds.len()).collect();
-        let starts = observations.iter().map(|obs| Trace { observations: vec![obs.clone()], ..Trace::default() });
-        let mut traced: Vec<Trace> = starts.collect();
-        let seat = Seat { number: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
-        evaluation.action_ms = time_of_action(agent, seat);
+        let starts = observations.iter().map(|obs| Episode { observations: vec![obs.clone()], ..Episode::default() });
+        let mut recorded: Vec<Episode> = starts.collect();
+        let slot = Slot { index: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
+        evaluation.action_ms = time_of_action(agent, slot);
         let mut first = true;
         while !running.is_empty() {
             let envs = self.worlds.envs();
-            let seats = running.iter().map(|&i| Seat { number: i, first, obs: &observations[i], world: &envs[i] });
-            let seats: Vec<Seat> = seats.collect();
+            let slots = running.iter().map(|&i| Slot { index: i, first, obs: &observations[i], world: &envs[i] });
+            let slots: Vec<Slot> = slots.collect();
             let mut actions = vec![None; seeds.len()];
-            for (&i, action) in running.iter().zip(agent.act_all(&seats)) {
+            for (&i, action) in running.iter().zip(agent.act_all(&slots)) {
                 actions[i] = Some(action);
             }
             first = false;
             for (i, step) in self.worlds.step(&actions)?.into_iter().enumerate() {
                 let Some(step) = step else { continue };
-                let episode = &mut episodes[i];
-                episode.total += f64::from(step.reward);
-                episode.success = step.success;
-                episode.length += 1;
-                episode.stage = episode.stage.max(step.stage);
+                let result = &mut results[i];
+                result.total += f64::from(step.reward);
+                result.success = step.success;
+                result.length += 1;
+                result.stage = result.stage.max(step.stage);
                 paths[i].extend(self.worlds.envs()[i].hand());
-                traced[i].observations.push(step.observation.clone());
-                traced[i].actions.extend(actions[i].clone());
-                traced[i].rewards.push(step.reward);
-                traced[i].terminated = step.terminated;
+                recorded[i].observations.push(step.observation.clone());
+                recorded[i].actions.extend(actions[i].clone());
+                recorded[i].rewards.push(step.reward);
+                recorded[i].terminated = step.terminated;
                 if step.done() {
                     running.retain(|&other| other != i);
                 }
                 observations[i] = step.observation;
             }
         }
-        for (episode, path) in episodes.iter_mut().zip(&paths) {
+        for (result, path) in results.iter_mut().zip(&paths) {
             if let Some((sparc, ldlj)) = smoothness::of_path(path, dt) {
-                (episode.sparc, episode.ldlj) = (Some(sparc), Some(ldlj));
+                (result.sparc, result.ldlj) = (Some(sparc), Some(ldlj));
             }
         }
-        evaluation.episodes.extend(episodes);
-        evaluation.traces.extend(traced);
+        evaluation.results.extend(results);
+        evaluation.episodes.extend(recorded);
         Ok(())
     }
 }
 
 /// Milliseconds that one action takes at the start of an episode: the median of a few.
-fn time_of_action(agent: &mut dyn Agent, seat: Seat) -> f64 {
+fn time_of_action(agent: &mut dyn Agent, slot: Slot) -> f64 {
     let mut times: Vec<f64> = (0..5)
         .map(|_| {
             let start = Instant::now();
-            std::hint::black_box(agent.act_all(&[seat]));
+            std::hint::black_box(agent.act_all(&[slot]));
             start.elapsed().as_secs_f64() * 1e3
         })
         .collect();

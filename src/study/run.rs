@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::config::RunConfig;
-use super::evaluate::{Evaluation, Judge, Starts, Summary};
+use super::evaluate::{EvalSeeds, Evaluation, Evaluator, Summary};
 use super::statistics::{correlation, mean};
 use crate::agent::{Agent, Expectation, Mode};
 use crate::env::{Env, World};
@@ -173,7 +173,7 @@ pub struct Run {
     config: RunConfig,
     folder: PathBuf,
     world: World,
-    judge: Judge,
+    evaluator: Evaluator,
     agent: Box<dyn Agent>,
     progress: Progress,
     obs: Vec<f32>,
@@ -185,7 +185,7 @@ pub struct Run {
 }
 
 impl Run {
-    /// Starts a run in `folder`, or goes on with the one that is there.
+    /// EvalSeeds a run in `folder`, or goes on with the one that is there.
     ///
     /// # Errors
     /// If the folder holds a run with other settings, a damaged checkpoint, or cannot be written.
@@ -210,7 +210,7 @@ impl Run {
         let make = || config.world();
         let mut run = Self {
             world,
-            judge: Judge::new(make)?,
+            evaluator: Evaluator::new(make)?,
             agent,
             obs: Vec::new(),
             episode_return: 0.0,
@@ -317,9 +317,9 @@ impl Run {
 
     fn evaluate(&mut self) -> Result<Event> {
         let episodes = self.config.evaluation_episodes;
-        let evaluation = self.judge.evaluate(self.agent.as_mut(), episodes, Starts::Training)?;
+        let evaluation = self.evaluator.evaluate(self.agent.as_mut(), episodes, EvalSeeds::Training)?;
         let row = EvaluationRow::new(self.progress.step, evaluation.summary());
-        let model = self.agent.judge_model(&evaluation.traces).into_iter();
+        let model = self.agent.judge_model(&evaluation.episodes).into_iter();
         let step = self.progress.step;
         self.progress.model.extend(model.map(|OpenLoop { horizon, rmse, nll, coverage90, rmse_p90 }| ModelRow {
             step,
@@ -329,7 +329,7 @@ impl Run {
             coverage90,
             rmse_p90,
         }));
-        self.progress.values.extend(ValueRow::new(step, &self.agent.judge_values(&evaluation.traces)));
+        self.progress.values.extend(ValueRow::new(step, &self.agent.judge_values(&evaluation.episodes)));
         self.evaluated_at = Some(self.progress.step);
         self.progress.evaluations.push(row.clone());
         Ok(Event::Evaluated(row))
@@ -337,13 +337,13 @@ impl Run {
 
     fn test(&mut self) -> Result<Event> {
         let (test, agent) = (&mut self.progress.test, self.agent.as_mut());
-        let complete = self.judge.go_on(test, agent, self.config.test_episodes, Starts::Test)?;
+        let complete = self.evaluator.next_batch(test, agent, self.config.test_episodes, EvalSeeds::Test)?;
         self.save()?;
         let test = &self.progress.test;
         if !complete {
-            return Ok(Event::Testing(test.episodes.len()));
+            return Ok(Event::Testing(test.results.len()));
         }
-        let rows = test.episodes.iter().enumerate();
+        let rows = test.results.iter().enumerate();
         let rows = rows.map(|(i, episode)| (i + 1, episode));
         write_csv(&self.folder.join("test.csv"), &TEST_COLUMNS, rows)?;
         let summary = toml::to_string(&test.summary()).expect("a summary is TOML");

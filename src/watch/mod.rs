@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::agent::{Agent, Foreseen, Seat};
+use crate::agent::{Agent, ImaginedTrajectory, Slot};
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
 use crate::env::scene::Body;
 use crate::env::{Env, World};
@@ -81,8 +81,8 @@ impl Recording {
         let mut frames = vec![Frame { poses: poses(world), reward: 0.0, success: false, action: rest }];
         let mut paths = Vec::new();
         loop {
-            let seat = Seat { number: 0, first: frames.len() == 1, obs: &obs, world };
-            let (action, futures) = agent.act_and_show(&seat);
+            let slot = Slot { index: 0, first: frames.len() == 1, obs: &obs, world };
+            let (action, futures) = agent.act_and_show(&slot);
             paths.push(drawn_futures(world, &futures));
             let step = world.step(&action)?;
             frames.push(Frame { poses: poses(world), reward: step.reward, success: step.success, action });
@@ -155,7 +155,7 @@ impl Recording {
 }
 
 /// Futures as lines in the world, their values scaled to lie between 0 and 1.
-fn drawn_futures(world: &World, futures: &[Foreseen]) -> Vec<Path3> {
+fn drawn_futures(world: &World, futures: &[ImaginedTrajectory]) -> Vec<Path3> {
     let values = || futures.iter().map(|future| f64::from(future.value)).filter(|value| value.is_finite());
     let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
     let drawn = futures.iter().filter(|future| future.value.is_finite()).map(|future| Path3 {

@@ -11,8 +11,8 @@ use crate::error::{Error, Result};
 use crate::model::rssm::layers_of;
 use crate::model::{Latent, WorldModel};
 use crate::nn::ops::{self, record};
-use crate::nn::{BoundedNormal, Learning, Mlp, Tensor3, copy_parameters, parameters_of_fields, polyak, tensor, values};
-use crate::replay::Sequences;
+use crate::nn::{BoundedNormal, Grad, Mlp, Tensor3, copy_parameters, parameters_of_fields, polyak, tensor, values};
+use crate::replay::SequenceBatch;
 use crate::rng::{self, Rng};
 
 /// Settings of an [`ActorCritic`].
@@ -108,7 +108,7 @@ impl ActorCritic {
     }
 
     /// Lets the slow critic follow.
-    pub fn guide(&self, slow: &mut SlowCritic) {
+    pub fn update_target(&self, slow: &mut SlowCritic) {
         polyak(slow, &self.critic, self.config.slow_rate);
     }
 
@@ -119,7 +119,7 @@ impl ActorCritic {
     /// The policy's mean actions, `[rows, actions]`; or those that lie `noise` (of the same form) deviations away from
     /// them, which may lie beyond [-1, 1].
     pub fn act(&self, features: &Tensor3, noise: Option<&[f32]>) -> Vec<f32> {
-        let head = self.policy.forward(features.clone(), Learning::Frozen);
+        let head = self.policy.forward(features.clone(), Grad::Input);
         let rows = values(&head).chunks_exact(2 * self.actions);
         let drawn = rows.flat_map(|head| (0..self.actions).map(|i| self.distribution(head, i)));
         match noise {
@@ -130,7 +130,7 @@ impl ActorCritic {
 
     /// What the critic says of features.
     pub fn values(&self, world: &WorldModel, features: &Tensor3) -> Vec<f32> {
-        world.bins().read(&self.critic.forward(features.clone(), Learning::Frozen))
+        world.bins().read(&self.critic.forward(features.clone(), Grad::Input))
     }
 
     /// Dreams from each row of `start`.
@@ -138,7 +138,7 @@ impl ActorCritic {
         let mut latent = start.clone();
         let mut features = vec![latent.features()];
         let mut actions = Vec::with_capacity(self.config.horizon);
-        let rows = start.memory.shape().1;
+        let rows = start.deter.shape().1;
         for t in 0..self.config.horizon {
             let noise: Vec<f32> = (0..rows * self.actions).map(|_| rng::normal(rng) as f32).collect();
             let drawn = self.act(&features[t], Some(&noise));
@@ -181,7 +181,7 @@ impl ActorCritic {
                 dream.returns[t].iter().zip(&dream.values[t]).map(|(r, v)| (r - v) / scale).collect();
             advantage += share * advantages.iter().map(|a| a.abs()).sum::<f32>() / advantages.len() as f32;
             let policy = record(tape, features, |features| {
-                let head = self.policy.forward(features, Learning::FromData);
+                let head = self.policy.forward(features, Grad::Params);
                 ops::rowwise(head, |row, head, slope| {
                     let actions = &actions[row * self.actions..][..self.actions];
                     let (loss, nats) = self.policy_loss(head, actions, weights[row], advantages[row], slope);
@@ -189,9 +189,9 @@ impl ActorCritic {
                     loss
                 })
             });
-            let steady = world.bins().read(&slow.forward(features.clone(), Learning::Frozen));
+            let steady = world.bins().read(&slow.forward(features.clone(), Grad::Input));
             let critic = record(tape, features, |features| {
-                let logits = self.critic.forward(features, Learning::FromData);
+                let logits = self.critic.forward(features, Grad::Params);
                 ops::scale_rows(world.bins().loss(logits, &[&dream.returns[t], &steady]), weights)
             });
             of_policy += share * ops::mean(&policy);
@@ -229,15 +229,15 @@ impl ActorCritic {
         tape: &mut T,
         world: &WorldModel,
         slow: &SlowCritic,
-        batch: &Sequences,
+        batch: &SequenceBatch,
         features: &Tensor3,
         beyond: &[f32],
     ) -> (f32, Tensor3) {
         let (returns, counts) = replayed_returns(batch, beyond, world.config().discount(), self.config.lambda);
         let known = record(tape, features, |features| ops::rows(features, 0, returns.len()));
-        let steady = world.bins().read(&slow.forward(known.clone(), Learning::Frozen));
+        let steady = world.bins().read(&slow.forward(known.clone(), Grad::Input));
         let loss = record(tape, &known, |known| {
-            let logits = self.critic.forward(known, Learning::Trained);
+            let logits = self.critic.forward(known, Grad::Both);
             ops::scale_rows(world.bins().loss(logits, &[&returns, &steady]), &counts)
         });
         (self.config.replayed, loss)

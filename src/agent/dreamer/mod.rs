@@ -10,24 +10,24 @@ mod planner;
 mod returns;
 
 use dfdx::prelude::*;
-use dfdx::tensor::{Cpu, Gradients, Trace as _};
+use dfdx::tensor::{Cpu, Gradients};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use actor_critic::{ActorCritic, ActorCriticConfig, Dream, SlowCritic};
-pub use planner::Imagined;
+pub use planner::LatentObjective;
 pub use returns::{ReturnScale, lambda_returns, replayed_returns};
 
 use super::warm_up::RandomActions;
-use super::{Agent, Expectation, Foreseen, Losses, Mode, Seat};
+use super::{Agent, Expectation, ImaginedTrajectory, Losses, Mode, Slot};
 use crate::env::Spec;
 use crate::error::{Error, Result};
-use crate::model::open_loop::{OpenLoop, Trace, open_loop};
+use crate::model::open_loop::{Episode, OpenLoop, open_loop};
 use crate::model::{Latent, WorldModel, WorldModelConfig};
 use crate::nn::ops::{self, record};
 use crate::nn::{Adam, AdamConfig, Parameters, Weights, parameters_of_fields, tensor};
 use crate::plan::{ControlConfig, PlannerConfig, RecedingHorizon};
-use crate::replay::{SequenceReplay, Sequences, Transition};
+use crate::replay::{SequenceBatch, SequenceReplay, Transition};
 use crate::rng::{self, Rng};
 
 /// Each update is cut into so many parts, which learn side by side. A fixed number: results do not depend on the machine.
@@ -64,10 +64,10 @@ pub struct DreamerConfig {
     /// Random steps before the first update.
     pub warm_up: usize,
     /// Exponent of the noise of which random actions are made: 0 is white.
-    pub warm_up_colour: f64,
+    pub warm_up_noise_beta: f64,
     /// Exponent of the noise that moves actions about the policy's mean while it explores: 0 is white, as in the reference.
     /// Slower noise takes a hand somewhere (Eberhard et al. 2023).
-    pub exploration_colour: f64,
+    pub exploration_noise_beta: f64,
     /// Moments remembered.
     pub replay: usize,
 }
@@ -87,8 +87,8 @@ impl Default for DreamerConfig {
             dreams: None,
             train_ratio: 1024.0,
             warm_up: 1024,
-            warm_up_colour: 0.0,
-            exploration_colour: 0.0,
+            warm_up_noise_beta: 0.0,
+            exploration_noise_beta: 0.0,
             replay: 1_000_000,
         }
     }
@@ -136,20 +136,20 @@ pub struct Dreamer {
     scale: ReturnScale,
     replay: SequenceReplay,
     observed: usize,
-    /// Updates that are owed for what was lived through.
-    owed: f32,
+    /// Updates that are update_credit for what was lived through.
+    update_credit: f32,
     random: RandomActions,
     /// Moves its actions while it explores.
     noise: RandomActions,
     /// Acts where it learns.
-    mind: Mind,
-    /// Act where it is judged, one for each seat.
-    seats: Vec<Mind>,
+    policy_state: PolicyState,
+    /// Act where it is judged, one for each slot.
+    slots: Vec<PolicyState>,
     rng: Rng,
 }
 
 /// What is believed in one world, and what was done there last.
-struct Mind {
+struct PolicyState {
     belief: Latent,
     action: Vec<f32>,
     control: Option<RecedingHorizon>,
@@ -176,20 +176,20 @@ impl Dreamer {
         let optimiser = AdamConfig { warm_up: config.learning_warm_up, ..AdamConfig::laprop(config.learning_rate) };
         let mut agent = Self {
             actions: spec.action_size,
-            mind: Mind::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
+            policy_state: PolicyState::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
             networks: Networks { world, behaviour, slow },
             optimiser: Adam::new(optimiser),
             scale: ReturnScale::default(),
             replay: SequenceReplay::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
-            owed: 0.0,
-            random: RandomActions::new(config.warm_up_colour, spec.horizon, spec.action_size),
-            noise: RandomActions::new(config.exploration_colour, spec.horizon, spec.action_size),
-            seats: Vec::new(),
+            update_credit: 0.0,
+            random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
+            noise: RandomActions::new(config.exploration_noise_beta, spec.horizon, spec.action_size),
+            slots: Vec::new(),
             rng,
             config,
         };
-        agent.mind.forget(&agent.networks.world);
+        agent.policy_state.forget(&agent.networks.world);
         Ok(agent)
     }
 
@@ -206,16 +206,17 @@ impl Dreamer {
     /// One update of everything, on stretches of experience drawn anew.
     pub fn learn(&mut self) -> Losses {
         let DreamerConfig { batch, length, .. } = self.config;
-        let shares: Vec<(Sequences, Rng)> = (0..PARTS)
+        let shares: Vec<(SequenceBatch, Rng)> = (0..PARTS)
             .map(|_| (self.replay.sample(batch / PARTS, length, &mut self.rng), rng::fork(&mut self.rng)))
             .collect();
         let networks = &self.networks;
         let dreams = self.config.dreams.unwrap_or(length);
-        let parts: Vec<Part> = shares.into_par_iter().map(|(batch, rng)| networks.study(&batch, dreams, rng)).collect();
+        let parts: Vec<Part> =
+            shares.into_par_iter().map(|(batch, rng)| networks.world_model_update(&batch, dreams, rng)).collect();
         let mut returns: Vec<f32> = parts.iter().flat_map(|part| part.dream.returns.concat()).collect();
         self.scale.update(&mut returns);
         let scale = self.scale.scale();
-        let parts: Vec<Part> = parts.into_par_iter().map(|part| networks.practise(part, scale)).collect();
+        let parts: Vec<Part> = parts.into_par_iter().map(|part| networks.actor_critic_update(part, scale)).collect();
 
         let mut losses = Losses::new();
         let mut gradients = Gradients::leaky();
@@ -232,36 +233,36 @@ impl Dreamer {
         losses.insert("gradient", self.optimiser.step(&mut self.networks, &mut gradients));
         losses.insert("return_scale", scale);
         let Networks { behaviour, slow, .. } = &mut self.networks;
-        behaviour.guide(slow);
+        behaviour.update_target(slow);
         losses
     }
 }
 
 impl Networks {
     /// The first half of a part of an update: the world model's losses, and dreams of where its last beliefs may lead.
-    fn study(&self, batch: &Sequences, dreams: usize, mut rng: Rng) -> Part {
+    fn world_model_update(&self, batch: &SequenceBatch, dreams: usize, mut rng: Rng) -> Part {
         let Self { world, behaviour, slow } = self;
         let mut tape = OwnedTape::default();
-        let lesson = world.lesson(&mut tape, batch, &mut rng);
+        let loss = world.loss(&mut tape, batch, &mut rng);
         let batch = batch.last(dreams);
         let rows = dreams * batch.sequences;
-        let dream = behaviour.dream(world, &lesson.latent.last(rows), &mut rng);
-        let last = record(&mut tape, &lesson.features, |all| {
+        let dream = behaviour.dream(world, &loss.latent.last(rows), &mut rng);
+        let last = record(&mut tape, &loss.features, |all| {
             let count = all.shape().1;
             ops::rows(all, count - rows, rows)
         });
         let replayed = behaviour.replayed_loss(&mut tape, world, slow, &batch, &last, &dream.returns[0]);
-        let mut losses: Losses = lesson.losses.iter().map(|(name, _, loss)| (*name, ops::mean(loss))).collect();
+        let mut losses: Losses = loss.losses.iter().map(|(name, _, loss)| (*name, ops::mean(loss))).collect();
         losses.insert("replayed_value", ops::mean(&replayed.1));
-        losses.insert("posterior_entropy", lesson.entropies[0]);
-        losses.insert("prior_entropy", lesson.entropies[1]);
-        let mut all: Vec<_> = lesson.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
+        losses.insert("posterior_entropy", loss.entropies[0]);
+        losses.insert("prior_entropy", loss.entropies[1]);
+        let mut all: Vec<_> = loss.losses.into_iter().map(|(_, weight, loss)| (weight, loss)).collect();
         all.push(replayed);
         Part { gradients: ops::total(tape, &all).backward(), losses, dream }
     }
 
     /// The second half: actor and critic learn from the dreams.
-    fn practise(&self, part: Part, scale: f32) -> Part {
+    fn actor_critic_update(&self, part: Part, scale: f32) -> Part {
         let Part { gradients, mut losses, dream } = part;
         let Self { world, behaviour, slow } = self;
         // Onto the gradients that are there already.
@@ -272,7 +273,7 @@ impl Networks {
     }
 }
 
-impl Mind {
+impl PolicyState {
     fn new(world: &WorldModel, config: &DreamerConfig, actions: usize, rng: Rng) -> Self {
         let control = config.planner.as_ref().map(|planner| RecedingHorizon::new(planner, actions, &config.control));
         Self { belief: world.initial(1), action: vec![0.0; actions], control, rng }
@@ -300,7 +301,7 @@ impl Mind {
         let action = match &mut self.control {
             Some(control) => {
                 let rng = rng::fork(&mut self.rng);
-                let mut objective = Imagined { world, critic: behaviour, belief: &self.belief, rng };
+                let mut objective = LatentObjective { world, critic: behaviour, belief: &self.belief, rng };
                 control.act(&mut objective, &mut |_| {}, &mut self.rng)
             }
             None => behaviour.act(&self.belief.features(), noise),
@@ -316,35 +317,38 @@ impl Agent for Dreamer {
             return self.random.next(&mut self.rng);
         }
         let noise = (mode == Mode::Explore).then(|| self.noise.deviates(&mut self.rng));
-        self.mind.act(&self.networks, obs, noise.as_deref())
+        self.policy_state.act(&self.networks, obs, noise.as_deref())
     }
 
-    fn act_all(&mut self, seats: &[Seat]) -> Vec<Vec<f32>> {
-        let Self { seats: minds, config, networks, actions, .. } = self;
-        let fresh =
-            |number: usize| Mind::new(&networks.world, config, *actions, rng::stream(number as u64, "dreamer seat"));
-        for seat in seats {
-            while minds.len() <= seat.number {
-                minds.push(fresh(minds.len()));
+    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        let Self { slots: policy_states, config, networks, actions, .. } = self;
+        let fresh = |number: usize| {
+            PolicyState::new(&networks.world, config, *actions, rng::stream(number as u64, "dreamer seat"))
+        };
+        for slot in slots {
+            while policy_states.len() <= slot.index {
+                policy_states.push(fresh(policy_states.len()));
             }
-            if seat.first {
-                minds[seat.number] = fresh(seat.number);
+            if slot.first {
+                policy_states[slot.index] = fresh(slot.index);
             }
         }
-        let mut minds: Vec<Option<&mut Mind>> = minds.iter_mut().map(Some).collect();
-        let busy: Vec<(&Seat, &mut Mind)> =
-            seats.iter().map(|seat| (seat, minds[seat.number].take().expect("seats have different numbers"))).collect();
-        busy.into_par_iter().map(|(seat, mind)| mind.act(networks, seat.obs, None)).collect()
+        let mut policy_states: Vec<Option<&mut PolicyState>> = policy_states.iter_mut().map(Some).collect();
+        let busy: Vec<(&Slot, &mut PolicyState)> = slots
+            .iter()
+            .map(|slot| (slot, policy_states[slot.index].take().expect("seats have different numbers")))
+            .collect();
+        busy.into_par_iter().map(|(slot, policy_state)| policy_state.act(networks, slot.obs, None)).collect()
     }
 
-    fn act_and_show(&mut self, seat: &Seat) -> (Vec<f32>, Vec<Foreseen>) {
-        let action = self.act_all(&[*seat]).remove(0);
+    fn act_and_show(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        let action = self.act_all(&[*slot]).remove(0);
         let Networks { world, behaviour, .. } = &self.networks;
-        let start = self.seats[seat.number].belief.repeated(0, SHOWN);
+        let start = self.slots[slot.index].belief.repeated(0, SHOWN);
         let dream = behaviour.dream(world, &start, &mut rng::stream(0, "dreamer foresight"));
         let told: Vec<Vec<f32>> = dream.features.iter().map(|features| world.decode(features)).collect();
-        let width = seat.obs.len();
-        let foreseen = (0..SHOWN).map(|i| Foreseen {
+        let width = slot.obs.len();
+        let foreseen = (0..SHOWN).map(|i| ImaginedTrajectory {
             observations: told.iter().map(|rows| rows[i * width..][..width].to_vec()).collect(),
             value: dream.returns[0][i],
             disagreement: 0.0,
@@ -356,7 +360,7 @@ impl Agent for Dreamer {
         self.replay.push(transition);
         self.observed += 1;
         if transition.terminated || transition.truncated {
-            self.mind.forget(&self.networks.world);
+            self.policy_state.forget(&self.networks.world);
             self.random.reset();
             self.noise.reset();
         }
@@ -366,35 +370,35 @@ impl Agent for Dreamer {
         if self.observed < self.config.warm_up {
             return None;
         }
-        self.owed += self.config.train_ratio / (self.config.batch * self.config.length) as f32;
+        self.update_credit += self.config.train_ratio / (self.config.batch * self.config.length) as f32;
         let mut losses = None;
-        while self.owed >= 1.0 {
-            self.owed -= 1.0;
+        while self.update_credit >= 1.0 {
+            self.update_credit -= 1.0;
             losses = Some(self.learn());
         }
         losses
     }
 
-    fn judge_model(&self, traces: &[Trace]) -> Vec<OpenLoop> {
-        open_loop(&self.networks.world, traces, &mut rng::stream(0, "open loop"))
+    fn judge_model(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
+        open_loop(&self.networks.world, episodes, &mut rng::stream(0, "open loop"))
     }
 
-    fn judge_values(&self, traces: &[Trace]) -> Vec<Expectation> {
+    fn judge_values(&self, episodes: &[Episode]) -> Vec<Expectation> {
         let Self { networks: Networks { world, behaviour, .. }, config, actions, .. } = self;
         let discount = config.world.discount();
-        let of_episode = |(i, trace): (usize, &Trace)| {
-            let mut mind = Mind::new(world, config, *actions, rng::stream(i as u64, "dreamer values"));
-            let values = trace.observations.iter().enumerate().map(|(t, obs)| {
-                mind.look(world, obs);
-                if let Some(action) = trace.actions.get(t) {
-                    mind.action.clone_from(action);
+        let of_episode = |(i, episode): (usize, &Episode)| {
+            let mut policy_state = PolicyState::new(world, config, *actions, rng::stream(i as u64, "dreamer values"));
+            let values = episode.observations.iter().enumerate().map(|(t, obs)| {
+                policy_state.look(world, obs);
+                if let Some(action) = episode.actions.get(t) {
+                    policy_state.action.clone_from(action);
                 }
-                behaviour.values(world, &mind.belief.features())[0]
+                behaviour.values(world, &policy_state.belief.features())[0]
             });
             let values: Vec<f32> = values.collect();
-            Expectation::of_episode(&values, trace, discount)
+            Expectation::of_episode(&values, episode, discount)
         };
-        traces.par_iter().enumerate().flat_map_iter(of_episode).collect()
+        episodes.par_iter().enumerate().flat_map_iter(of_episode).collect()
     }
 
     fn weights(&self) -> Weights {
@@ -413,25 +417,26 @@ impl Agent for Dreamer {
         self.optimiser.save(&mut state, "optimiser");
         self.replay.save(&mut state, "replay");
         let [low, high] = self.scale.range();
-        state.insert("progress", vec![low, high, self.owed], [1, 1, 3]);
+        state.insert("progress", vec![low, high, self.update_credit], [1, 1, 3]);
         state.insert_counts("counts", &[self.observed as u64]);
         state.insert_counts("rng", &rng::state(&self.rng));
-        state.insert_counts("mind rng", &rng::state(&self.mind.rng));
+        state.insert_counts("mind rng", &rng::state(&self.policy_state.rng));
         state
     }
 
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
         let counts = state.counts("counts", 1)?;
-        let (own, mind) = (state.counts("rng", 4)?, state.counts("mind rng", 4)?);
-        let &[low, high, owed] = state.get("progress", [1, 1, 3])? else { unreachable!("three numbers") };
+        let (own, policy_state) = (state.counts("rng", 4)?, state.counts("mind rng", 4)?);
+        let &[low, high, update_credit] = state.get("progress", [1, 1, 3])? else { unreachable!("three numbers") };
         state.load_module("slow", &mut self.networks.slow)?;
         self.optimiser.load(state, "optimiser", &self.networks)?;
         self.replay.load(state, "replay")?;
         self.observed = counts[0] as usize;
         self.scale = ReturnScale::from_range(low, high);
-        self.owed = owed;
+        self.update_credit = update_credit;
         self.rng = rng::from_state(&own);
-        self.mind = Mind::new(&self.networks.world, &self.config, self.actions, rng::from_state(&mind));
+        self.policy_state =
+            PolicyState::new(&self.networks.world, &self.config, self.actions, rng::from_state(&policy_state));
         self.random.reset();
         self.noise.reset();
         Ok(())

@@ -4,12 +4,12 @@
 use super::actor_critic::ActorCritic;
 use crate::model::{Latent, WorldModel};
 use crate::nn::tensor;
-use crate::plan::{Objective, Sequences};
+use crate::plan::{ActionSequences, Objective};
 use crate::rng::Rng;
 
 /// What action sequences are worth from what is believed now: the rewards on the way and the critic's value of the end,
 /// both discounted. (PlaNet has no critic, and looks no farther than the plan.)
-pub struct Imagined<'a> {
+pub struct LatentObjective<'a> {
     /// The world.
     pub world: &'a WorldModel,
     /// Whose critic values the end.
@@ -20,8 +20,8 @@ pub struct Imagined<'a> {
     pub rng: Rng,
 }
 
-impl Objective for Imagined<'_> {
-    fn returns(&mut self, sequences: &Sequences) -> Vec<f32> {
+impl Objective for LatentObjective<'_> {
+    fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
         let (count, width) = (sequences.count(), sequences.actions);
         let mut latent = self.belief.repeated(0, count);
         let mut returns = vec![0.0; count];

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::replay::Sequences;
+use crate::replay::SequenceBatch;
 
 /// Lambda returns of imagined futures. `rewards`, `continues` and `values` hold a list for each moment, the start first: a
 /// reward is for arriving at its moment, a continue tells how much the future counts there. One list fewer comes back:
@@ -24,7 +24,7 @@ pub fn lambda_returns(rewards: &[Vec<f32>], continues: &[Vec<f32>], values: &[Ve
 
 /// Lambda returns of experience, for all moments of a batch but the last, and whether each has one: where an episode ends
 /// there is no future in the batch. `beyond` is what is believed of the future from each moment on.
-pub fn replayed_returns(batch: &Sequences, beyond: &[f32], discount: f32, lambda: f32) -> (Vec<f32>, Vec<f32>) {
+pub fn replayed_returns(batch: &SequenceBatch, beyond: &[f32], discount: f32, lambda: f32) -> (Vec<f32>, Vec<f32>) {
     let rows = batch.sequences;
     let moments = rows * (batch.length - 1);
     let (mut returns, mut counts) = (vec![0.0; moments], vec![0.0; moments]);
@@ -108,13 +108,13 @@ mod tests {
 
     #[test]
     fn replayed_returns_are_the_references() {
-        let batch = Sequences {
+        let batch = SequenceBatch {
             sequences: 1,
             length: 6,
             rewards: REWARDS.to_vec(),
             last: [0, 0, 0, 1, 0, 0].map(|x| x == 1).to_vec(),
             terminal: [0, 0, 0, 0, 0, 1].map(|x| x == 1).to_vec(),
-            ..Sequences::default()
+            ..SequenceBatch::default()
         };
         let (returns, counts) = replayed_returns(&batch, &[2.0, 1.9, 1.7, 1.6, 1.4, 1.2], 1.0 - 1.0 / 333.0, 0.95);
         near(&returns, &[2.813_668_76, 2.342_776_47, 2.595_195_2, 0.353_933_93, 0.3]);

@@ -1,8 +1,8 @@
 //! `lift`: take the cube from the table. robosuite's Lift, with its numbers.
 
 use super::task::{
-    HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, gripper_features, gripper_values, object_features,
-    object_state_of, object_values, on_table, towards, vector, way,
+    HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView, closeness, gripper_features, gripper_values,
+    object_features, object_state_of, object_values, on_table, towards, vector, way,
 };
 use crate::env::Feature;
 use crate::env::arm::Primitive;
@@ -49,22 +49,22 @@ impl TableTask for Lift {
         [gripper_features(), object_features("cube"), way("hand", "cube").collect()].concat()
     }
 
-    fn observe(&self, view: &View) -> Vec<f64> {
+    fn observe(&self, view: &TaskView) -> Vec<f64> {
         let cube = object_values(view, 0);
         let way: Vec<f64> = (0..3).map(|i| cube[i] - view.hand.translation.vector[i]).collect();
         [gripper_values(view, 0), cube, way].concat()
     }
 
-    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
         object_state_of(view, 0, "cube", "gripper_to_cube_pos")
     }
 
-    fn judge(&self, obs: &[f32]) -> Judgement {
+    fn outcome(&self, obs: &[f32]) -> TaskOutcome {
         let distance = vector(obs, HAND_TO_CUBE).norm();
         let grasped = grasped(obs);
         let success = vector(obs, CUBE).z > TABLE_TOP + LIFTED;
         let shaped = if success { 2.25 } else { closeness(distance) + if grasped { 0.25 } else { 0.0 } };
-        Judgement {
+        TaskOutcome {
             shaped: shaped / 2.25,
             success,
             stage: if success {

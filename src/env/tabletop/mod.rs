@@ -18,7 +18,7 @@ pub use lift::Lift;
 pub use push::Push;
 pub use reach::Reach;
 pub use stack::Stack;
-pub use task::{HAND_POSITION, HAND_VELOCITY, Judgement, Setup, TableTask, View};
+pub use task::{HAND_POSITION, HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView};
 
 use super::arm::{ArmDescription, JointVector, Pose};
 use super::kinematics::Kinematics;
@@ -177,11 +177,11 @@ impl Tabletop {
         &self.state.compact
     }
 
-    fn with_view<T>(&self, see: impl FnOnce(&View) -> T) -> T {
+    fn with_view<T>(&self, see: impl FnOnce(&TaskView) -> T) -> T {
         let state = &self.state;
         let joints = state.physics.joint_state();
         let kinematics = state.physics.kinematics(&joints.q);
-        see(&View {
+        see(&TaskView {
             physics: &state.physics,
             setup: &state.setup,
             joints: &joints,
@@ -238,10 +238,10 @@ impl Tabletop {
         }
     }
 
-    fn reward_of(&self, judgement: Judgement) -> f32 {
+    fn reward_of(&self, outcome: TaskOutcome) -> f32 {
         match self.options.reward {
-            RewardKind::Shaped => judgement.shaped as f32,
-            RewardKind::Sparse => f32::from(judgement.success),
+            RewardKind::Shaped => outcome.shaped as f32,
+            RewardKind::Sparse => f32::from(outcome.success),
         }
     }
 }
@@ -282,14 +282,14 @@ impl Env for Tabletop {
         self.advance();
         self.state.elapsed += 1;
         let observation = self.observe();
-        let judgement = self.task.judge(&self.state.compact);
+        let outcome = self.task.outcome(&self.state.compact);
         Ok(Step {
             observation,
-            reward: self.reward_of(judgement),
+            reward: self.reward_of(outcome),
             terminated: false,
             truncated: self.state.elapsed >= self.spec.horizon,
-            success: judgement.success,
-            stage: judgement.stage,
+            success: outcome.success,
+            stage: outcome.stage,
         })
     }
 
@@ -333,7 +333,7 @@ impl KnownReward for Tabletop {
     /// With [`ObservationKind::Robosuite`]: those observations do not determine the reward.
     fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
         assert_eq!(self.options.observation, ObservationKind::Compact, "the reward needs compact observations");
-        self.reward_of(self.task.judge(next_obs))
+        self.reward_of(self.task.outcome(next_obs))
     }
 }
 

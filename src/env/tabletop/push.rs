@@ -5,8 +5,8 @@
 use nalgebra::Vector3;
 
 use super::task::{
-    HAND_VELOCITY, Judgement, Setup, TableTask, View, closeness, cube_features, named, object_state_of, object_values,
-    on_table, towards, vector, way, xyz,
+    HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView, closeness, cube_features, named, object_state_of,
+    object_values, on_table, towards, vector, way, xyz,
 };
 use crate::env::Feature;
 use crate::env::arm::Primitive;
@@ -69,7 +69,7 @@ impl TableTask for Push {
             .collect()
     }
 
-    fn observe(&self, view: &View) -> Vec<f64> {
+    fn observe(&self, view: &TaskView) -> Vec<f64> {
         let mut values = object_values(view, 0);
         let cube = Vector3::new(values[0], values[1], values[2]);
         let goal = view.setup.goal.expect("push has a goal");
@@ -79,7 +79,7 @@ impl TableTask for Push {
         values
     }
 
-    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
         let goal = view.setup.goal.expect("push has a goal");
         let cube = view.physics.object_state(view.setup.objects[0]).pose.translation.vector;
         let mut values = object_state_of(view, 0, "cube", "gripper_to_cube_pos");
@@ -88,12 +88,12 @@ impl TableTask for Push {
         values
     }
 
-    fn judge(&self, obs: &[f32]) -> Judgement {
+    fn outcome(&self, obs: &[f32]) -> TaskOutcome {
         let hand_to_cube = vector(obs, HAND_TO_CUBE).norm();
         let cube_to_goal = vector(obs, CUBE_TO_GOAL).norm();
         let success = cube_to_goal < TOLERANCE;
         let shaped = if success { 1.0 } else { 0.25 * closeness(hand_to_cube) + 0.75 * closeness(cube_to_goal) };
-        Judgement { shaped, success, stage: if success { 2 } else { usize::from(hand_to_cube < 0.05) } }
+        TaskOutcome { shaped, success, stage: if success { 2 } else { usize::from(hand_to_cube < 0.05) } }
     }
 
     /// Behind the cube as seen from the goal, down, and through it towards the goal.

@@ -4,7 +4,9 @@
 
 use nalgebra::Vector3;
 
-use super::task::{HAND_POSITION, Judgement, Setup, TableTask, View, closeness, named, towards, vector, way, xyz};
+use super::task::{
+    HAND_POSITION, Setup, TableTask, TaskOutcome, TaskView, closeness, named, towards, vector, way, xyz,
+};
 use crate::env::Feature;
 use crate::env::physics::Physics;
 use crate::env::scene::Body;
@@ -44,21 +46,21 @@ impl TableTask for Reach {
         xyz("goal", [0.0, 0.0, 1.0], 0.15).map(Feature::constant).chain(way("hand", "goal")).collect()
     }
 
-    fn observe(&self, view: &View) -> Vec<f64> {
+    fn observe(&self, view: &TaskView) -> Vec<f64> {
         let goal = view.setup.goal.expect("reach has a goal");
         let way = goal - view.hand.translation.vector;
         goal.iter().chain(&way).copied().collect()
     }
 
-    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
         let goal = view.setup.goal.expect("reach has a goal");
         let way = goal - view.hand.translation.vector;
         [named("goal_pos", goal.iter()), named("gripper_to_goal", way.iter())].concat()
     }
 
-    fn judge(&self, obs: &[f32]) -> Judgement {
+    fn outcome(&self, obs: &[f32]) -> TaskOutcome {
         let distance = vector(obs, HAND_TO_GOAL).norm();
-        Judgement {
+        TaskOutcome {
             shaped: closeness(distance),
             success: distance < TOLERANCE,
             stage: usize::from(distance < 0.05) + usize::from(distance < TOLERANCE),

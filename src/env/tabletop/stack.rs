@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::lift::{CUBE, LIFTED, descend_and_close, grasped};
 use super::task::{
-    Judgement, Setup, TableTask, View, closeness, cube_features, gripper_features, gripper_values, named,
+    Setup, TableTask, TaskOutcome, TaskView, closeness, cube_features, gripper_features, gripper_values, named,
     object_state_of, object_values, on_table, towards, vector, way,
 };
 use crate::env::Feature;
@@ -67,7 +67,7 @@ impl TableTask for Stack {
             .collect()
     }
 
-    fn observe(&self, view: &View) -> Vec<f64> {
+    fn observe(&self, view: &TaskView) -> Vec<f64> {
         let (cube, base) = (object_values(view, 0), object_values(view, 1));
         let hand = view.hand.translation.vector;
         let to_cube: Vec<f64> = (0..3).map(|i| cube[i] - hand[i]).collect();
@@ -76,7 +76,7 @@ impl TableTask for Stack {
         [gripper_values(view, 0), cube, base, to_cube, to_base, vec![f64::from(touching)]].concat()
     }
 
-    fn object_state(&self, view: &View) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
         let [cube, base] = [0, 1].map(|i| view.physics.object_state(view.setup.objects[i]).pose.translation.vector);
         let a = object_state_of(view, 0, "cubeA", "gripper_to_cubeA");
         let b = object_state_of(view, 1, "cubeB", "gripper_to_cubeB");
@@ -84,7 +84,7 @@ impl TableTask for Stack {
         [&a[..7], &b[..7], &named("cubeA_to_cubeB", (base - cube).iter()), &a[7..], &b[7..]].concat()
     }
 
-    fn judge(&self, obs: &[f32]) -> Judgement {
+    fn outcome(&self, obs: &[f32]) -> TaskOutcome {
         let distance = vector(obs, HAND_TO_CUBE).norm();
         let grasped = grasped(obs);
         let lifted = vector(obs, CUBE).z > TABLE_TOP + LIFTED;
@@ -94,7 +94,7 @@ impl TableTask for Stack {
         let align = 0.5 * (1.0 - vector(obs, CUBE_TO_BASE).xy().norm().tanh());
         let lift = if lifted { 1.0 + align } else { 0.0 };
         let stack = if stacked { 2.0 } else { 0.0 };
-        Judgement {
+        TaskOutcome {
             shaped: reach.max(lift).max(stack) / 2.0,
             success: stacked,
             stage: if stacked {

@@ -25,7 +25,7 @@ pub struct Setup {
 }
 
 /// What a task can see when it composes an observation.
-pub struct View<'a> {
+pub struct TaskView<'a> {
     /// The world.
     pub physics: &'a Physics,
     /// What stands on the table.
@@ -42,7 +42,7 @@ pub struct View<'a> {
 
 /// What an observation is worth.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Judgement {
+pub struct TaskOutcome {
     /// The shaped reward, in [0, 1].
     pub shaped: f64,
     /// Whether the task is fulfilled.
@@ -67,11 +67,11 @@ pub trait TableTask: Send + Sync {
     /// The features that follow the hand's position and velocity in an observation.
     fn features(&self) -> Vec<Feature>;
     /// Their values.
-    fn observe(&self, view: &View) -> Vec<f64>;
+    fn observe(&self, view: &TaskView) -> Vec<f64>;
     /// robosuite's object state.
-    fn object_state(&self, view: &View) -> Vec<(String, f64)>;
+    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)>;
     /// What a compact observation is worth.
-    fn judge(&self, obs: &[f32]) -> Judgement;
+    fn outcome(&self, obs: &[f32]) -> TaskOutcome;
     /// What a hand-written policy does (hand action): it shows that the task can be solved.
     fn scripted(&self, obs: &[f32]) -> [f64; 4];
     /// Objects, in the order of [`Setup::objects`], and the goal, as they are drawn.
@@ -118,7 +118,7 @@ pub(super) fn cube_features(name: &str) -> impl Iterator<Item = Feature> {
 }
 
 /// The values of [`object_features`].
-pub(super) fn object_values(view: &View, object: usize) -> Vec<f64> {
+pub(super) fn object_values(view: &TaskView, object: usize) -> Vec<f64> {
     let state = view.physics.object_state(view.setup.objects[object]);
     let turn = state.pose.rotation;
     [state.pose.translation.vector, turn * Vector3::x(), turn * Vector3::z(), state.velocity]
@@ -138,7 +138,7 @@ pub(super) fn gripper_features() -> Vec<Feature> {
 }
 
 /// The values of [`gripper_features`].
-pub(super) fn gripper_values(view: &View, object: usize) -> Vec<f64> {
+pub(super) fn gripper_values(view: &TaskView, object: usize) -> Vec<f64> {
     let [left, right] = view.physics.pad_forces(view.setup.objects[object]);
     let opening = (view.joints.fingers[0] + view.joints.fingers[1]) / 2.0;
     vec![opening, view.finger_target, f64::from(left > 0.0), f64::from(right > 0.0)]
@@ -166,7 +166,7 @@ pub(super) fn on_table(rng: &mut Rng, reach: f64, half_height: f64, lift: f64) -
 
 /// Position and quaternion (x, y, z, w) of an object, and its distance vector from the hand, by
 /// robosuite's names.
-pub(super) fn object_state_of(view: &View, object: usize, name: &str, hand_to: &str) -> Vec<(String, f64)> {
+pub(super) fn object_state_of(view: &TaskView, object: usize, name: &str, hand_to: &str) -> Vec<(String, f64)> {
     let pose = view.physics.object_state(view.setup.objects[object]).pose;
     let position = pose.translation.vector;
     let to = position - view.hand.translation.vector;
