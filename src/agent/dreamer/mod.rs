@@ -19,7 +19,7 @@ pub use planner::LatentObjective;
 pub use returns::{ReturnScale, lambda_returns, replayed_returns};
 
 use super::warm_up::RandomActions;
-use super::{Agent, Expectation, ImaginedTrajectory, Losses, Mode, Slot};
+use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots, ValueEstimate};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::open_loop::{Episode, OpenLoop, open_loop};
@@ -130,7 +130,7 @@ parameters_of_fields!(Networks: world, behaviour);
 /// World model, actor and critic, and the experience that they learn from.
 pub struct Dreamer {
     config: DreamerConfig,
-    actions: usize,
+    action_size: usize,
     networks: Networks,
     optimiser: Adam,
     scale: ReturnScale,
@@ -143,8 +143,8 @@ pub struct Dreamer {
     noise: RandomActions,
     /// Acts where it learns.
     policy_state: PolicyState,
-    /// Act where it is judged, one for each slot.
-    slots: Vec<PolicyState>,
+    /// Act where it is evaluated.
+    slots: Slots<PolicyState>,
     rng: Rng,
 }
 
@@ -170,12 +170,13 @@ impl Dreamer {
     /// If a setting cannot be used.
     pub fn new(spec: &Spec, config: DreamerConfig, seed: u64) -> Result<Self> {
         config.check()?;
+        spec.check()?;
         let mut rng = rng::stream(seed, "dreamer");
         let world = WorldModel::new(spec, &config.world, &mut rng);
         let (behaviour, slow) = ActorCritic::new(&world, spec.action_size, &config.behaviour, &mut rng);
         let optimiser = AdamConfig { warm_up: config.learning_warm_up, ..AdamConfig::laprop(config.learning_rate) };
         let mut agent = Self {
-            actions: spec.action_size,
+            action_size: spec.action_size,
             policy_state: PolicyState::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
             networks: Networks { world, behaviour, slow },
             optimiser: Adam::new(optimiser),
@@ -185,11 +186,11 @@ impl Dreamer {
             update_credit: 0.0,
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
             noise: RandomActions::new(config.exploration_noise_beta, spec.horizon, spec.action_size),
-            slots: Vec::new(),
+            slots: Slots::default(),
             rng,
             config,
         };
-        agent.policy_state.forget(&agent.networks.world);
+        agent.policy_state.reset(&agent.networks.world);
         Ok(agent)
     }
 
@@ -274,13 +275,21 @@ impl Networks {
 }
 
 impl PolicyState {
+    /// The state of a slot, which depends on nothing but the slot's index.
+    fn of_slot(world: &WorldModel, config: &DreamerConfig, action_size: usize, index: usize) -> Self {
+        Self::new(world, config, action_size, rng::stream(index as u64, "dreamer seat"))
+    }
+
     fn new(world: &WorldModel, config: &DreamerConfig, actions: usize, rng: Rng) -> Self {
-        let control = config.planner.as_ref().map(|planner| RecedingHorizon::new(planner, actions, &config.control));
+        let control = config
+            .planner
+            .as_ref()
+            .map(|planner| RecedingHorizon::new(planner.build(actions), actions, &config.control));
         Self { belief: world.initial(1), action: vec![0.0; actions], control, rng }
     }
 
     /// A new episode begins.
-    fn forget(&mut self, world: &WorldModel) {
+    fn reset(&mut self, world: &WorldModel) {
         self.belief = world.initial(1);
         self.action.fill(0.0);
         if let Some(control) = &mut self.control {
@@ -312,55 +321,54 @@ impl PolicyState {
 }
 
 impl Agent for Dreamer {
+    fn begin_episode(&mut self) {
+        self.policy_state.reset(&self.networks.world);
+        self.random.reset();
+        self.noise.reset();
+        self.slots.clear(0);
+    }
+
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
-        if self.observed < self.config.warm_up && mode == Mode::Explore {
-            return self.random.next(&mut self.rng);
-        }
-        let noise = (mode == Mode::Explore).then(|| self.noise.deviates(&mut self.rng));
-        self.policy_state.act(&self.networks, obs, noise.as_deref())
-    }
-
-    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        let Self { slots: policy_states, config, networks, actions, .. } = self;
-        let fresh = |number: usize| {
-            PolicyState::new(&networks.world, config, *actions, rng::stream(number as u64, "dreamer seat"))
-        };
-        for slot in slots {
-            while policy_states.len() <= slot.index {
-                policy_states.push(fresh(policy_states.len()));
-            }
-            if slot.first {
-                policy_states[slot.index] = fresh(slot.index);
+        let Self { config, networks, action_size, observed, random, noise, policy_state, slots, rng, .. } = self;
+        match mode {
+            Mode::Explore if *observed < config.warm_up => random.next(rng),
+            Mode::Explore => policy_state.act(networks, obs, Some(&noise.deviates(rng))),
+            Mode::Evaluate => {
+                let fresh = |i| PolicyState::of_slot(&networks.world, config, *action_size, i);
+                slots.state(0, fresh).act(networks, obs, None)
             }
         }
-        let mut policy_states: Vec<Option<&mut PolicyState>> = policy_states.iter_mut().map(Some).collect();
-        let busy: Vec<(&Slot, &mut PolicyState)> = slots
-            .iter()
-            .map(|slot| (slot, policy_states[slot.index].take().expect("seats have different numbers")))
-            .collect();
-        busy.into_par_iter().map(|(slot, policy_state)| policy_state.act(networks, slot.obs, None)).collect()
     }
 
-    fn act_and_show(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        let action = self.act_all(&[*slot]).remove(0);
+    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        let Self { slots: states, config, networks, action_size, .. } = self;
+        let fresh = |i| PolicyState::of_slot(&networks.world, config, *action_size, i);
+        let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
+        let each = states.states(slots, fresh).into_par_iter().zip(observations);
+        each.map(|(state, obs)| state.act(networks, obs, None)).collect()
+    }
+
+    fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        let action = self.act_batch(&[*slot]).remove(0);
         let Networks { world, behaviour, .. } = &self.networks;
-        let start = self.slots[slot.index].belief.repeated(0, SHOWN);
+        let fresh = |i| PolicyState::of_slot(world, &self.config, self.action_size, i);
+        let start = self.slots.state(slot.index, fresh).belief.repeated(0, SHOWN);
         let dream = behaviour.dream(world, &start, &mut rng::stream(0, "dreamer foresight"));
-        let told: Vec<Vec<f32>> = dream.features.iter().map(|features| world.decode(features)).collect();
+        let decoded: Vec<Vec<f32>> = dream.features.iter().map(|features| world.decode(features)).collect();
         let width = slot.obs.len();
-        let foreseen = (0..SHOWN).map(|i| ImaginedTrajectory {
-            observations: told.iter().map(|rows| rows[i * width..][..width].to_vec()).collect(),
+        let trajectories = (0..SHOWN).map(|i| ImaginedTrajectory {
+            observations: decoded.iter().map(|rows| rows[i * width..][..width].to_vec()).collect(),
             value: dream.returns[0][i],
             disagreement: 0.0,
         });
-        (action, foreseen.collect())
+        (action, trajectories.collect())
     }
 
     fn observe(&mut self, transition: &Transition) {
         self.replay.push(transition);
         self.observed += 1;
         if transition.terminated || transition.truncated {
-            self.policy_state.forget(&self.networks.world);
+            self.policy_state.reset(&self.networks.world);
             self.random.reset();
             self.noise.reset();
         }
@@ -378,16 +386,19 @@ impl Agent for Dreamer {
         }
         losses
     }
+}
 
-    fn judge_model(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
+impl Diagnostics for Dreamer {
+    fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         open_loop(&self.networks.world, episodes, &mut rng::stream(0, "open loop"))
     }
 
-    fn judge_values(&self, episodes: &[Episode]) -> Vec<Expectation> {
-        let Self { networks: Networks { world, behaviour, .. }, config, actions, .. } = self;
+    fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
+        let Self { networks: Networks { world, behaviour, .. }, config, action_size, .. } = self;
         let discount = config.world.discount();
         let of_episode = |(i, episode): (usize, &Episode)| {
-            let mut policy_state = PolicyState::new(world, config, *actions, rng::stream(i as u64, "dreamer values"));
+            let mut policy_state =
+                PolicyState::new(world, config, *action_size, rng::stream(i as u64, "dreamer values"));
             let values = episode.observations.iter().enumerate().map(|(t, obs)| {
                 policy_state.look(world, obs);
                 if let Some(action) = episode.actions.get(t) {
@@ -396,11 +407,13 @@ impl Agent for Dreamer {
                 behaviour.values(world, &policy_state.belief.features())[0]
             });
             let values: Vec<f32> = values.collect();
-            Expectation::of_episode(&values, episode, discount)
+            ValueEstimate::of_episode(&values, episode, discount)
         };
         episodes.par_iter().enumerate().flat_map_iter(of_episode).collect()
     }
+}
 
+impl Checkpoint for Dreamer {
     fn weights(&self) -> Weights {
         let mut weights = Weights::default();
         weights.insert_module("dreamer", &self.networks);
@@ -436,7 +449,7 @@ impl Agent for Dreamer {
         self.update_credit = update_credit;
         self.rng = rng::from_state(&own);
         self.policy_state =
-            PolicyState::new(&self.networks.world, &self.config, self.actions, rng::from_state(&policy_state));
+            PolicyState::new(&self.networks.world, &self.config, self.action_size, rng::from_state(&policy_state));
         self.random.reset();
         self.noise.reset();
         Ok(())
