@@ -6,7 +6,7 @@
 use nalgebra::{RealField, UnitQuaternion, Vector3};
 
 use super::arm::{Pose, Primitive};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::{Env, Feature, KnownReward, Snapshot, Spec, Step};
 use crate::error::Result;
 use crate::rng;
@@ -137,13 +137,15 @@ impl Env for CartPole {
         let cart = Pose::translation(at.x, at.y, at.z);
         vec![Pose::translation(0.0, 0.0, 0.38), cart, Pose::from_parts(at.into(), lean)]
     }
-}
 
-impl CartPole {
-    /// Where the pole's tip would be drawn, m.
-    pub(super) fn tip(obs: &[f32]) -> [f64; 3] {
+    fn camera(&self) -> Camera {
+        Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] }
+    }
+
+    /// The pole's tip.
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
         let (sin, cos) = f64::from(obs[2]).sin_cos();
-        [f64::from(obs[0]) + 2.0 * HALF_LENGTH * sin, 0.0, 0.5 + 2.0 * HALF_LENGTH * cos]
+        Some([f64::from(obs[0]) + 2.0 * HALF_LENGTH * sin, 0.0, 0.5 + 2.0 * HALF_LENGTH * cos])
     }
 }
 

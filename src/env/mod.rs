@@ -144,12 +144,19 @@ impl Step {
     }
 }
 
-/// A world to act in.
-pub trait Env: Send {
-    /// What it looks like from outside.
+/// An environment: everything that training an agent requires of it.
+///
+/// Drawing is optional: an environment that gives [`Env::scene`] and [`Env::poses`] can be watched as a 3D replay,
+/// [`Env::position_of`] draws what an agent imagined into it, [`Env::camera`] says from where it is seen.
+///
+/// `Box<dyn Env>` is an environment too, so that code generic over `E: Env` also takes one that is chosen at run time;
+/// `<dyn Env>::downcast_ref` gets the concrete type back.
+pub trait Env: std::any::Any + Send {
+    /// The names, sizes and units of observations and actions. It does not change.
     fn spec(&self) -> &Spec;
 
-    /// EvalSeeds an episode; the seed fixes everything that is drawn in it. Returns the first observation.
+    /// Starts an episode; the seed fixes everything that is drawn at random in it. Returns the first observation,
+    /// [`Spec::observation_size`] numbers.
     fn reset(&mut self, seed: u64) -> Vec<f32>;
 
     /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.
@@ -158,19 +165,73 @@ pub trait Env: Send {
     /// [`Error::BadAction`] if the action has the wrong length or is not finite; nothing has moved then.
     fn step(&mut self, action: &[f32]) -> Result<Step>;
 
-    /// Where the hand is (m), in worlds that have one: smoothness is measured there.
+    /// Position (m) of the tracked point, a robot's hand for example; the smoothness of motion is measured there. None
+    /// (the default) if there is no such point.
     fn hand(&self) -> Option<[f64; 3]> {
         None
     }
 
-    /// What there is to draw. Empty by default.
+    /// The bodies to draw. Empty by default.
     fn scene(&self) -> Vec<scene::Body> {
         Vec::new()
     }
 
-    /// Where each body of [`Env::scene`] is now.
+    /// The pose of each body of [`Env::scene`] at this time step, in the same order (position in m).
     fn poses(&self) -> Vec<arm::Pose> {
         Vec::new()
+    }
+
+    /// The camera of the 3D replay. By default it looks at the origin from about four metres.
+    fn camera(&self) -> scene::Camera {
+        scene::Camera::default()
+    }
+
+    /// The point (m) at which an imagined observation is drawn: the hand, the tip of a pole. None (the default) if
+    /// observations do not tell.
+    fn position_of(&self, _obs: &[f32]) -> Option<[f64; 3]> {
+        None
+    }
+}
+
+impl Env for Box<dyn Env> {
+    fn spec(&self) -> &Spec {
+        (**self).spec()
+    }
+
+    fn reset(&mut self, seed: u64) -> Vec<f32> {
+        (**self).reset(seed)
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step> {
+        (**self).step(action)
+    }
+
+    fn hand(&self) -> Option<[f64; 3]> {
+        (**self).hand()
+    }
+
+    fn scene(&self) -> Vec<scene::Body> {
+        (**self).scene()
+    }
+
+    fn poses(&self) -> Vec<arm::Pose> {
+        (**self).poses()
+    }
+
+    fn camera(&self) -> scene::Camera {
+        (**self).camera()
+    }
+
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        (**self).position_of(obs)
+    }
+}
+
+impl dyn Env {
+    /// The environment as the type that it is, also from inside a `Box<dyn Env>`. None if it is another type.
+    pub fn downcast_ref<E: Env>(&self) -> Option<&E> {
+        let any: &dyn std::any::Any = self;
+        any.downcast_ref::<E>().or_else(|| any.downcast_ref::<Box<dyn Env>>()?.as_ref().downcast_ref::<E>())
     }
 }
 

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use nalgebra::{RealField, UnitQuaternion, Vector3};
 
 use super::arm::{Pose, Primitive};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::{Env, Feature, KnownReward, Snapshot, Spec, Step};
 use crate::error::Result;
 use crate::rng;
@@ -129,12 +129,14 @@ impl Env for Pendulum {
         let rod = Pose::from_parts(Vector3::new(0.0, 0.0, 1.2).into(), turn);
         vec![rod, rod * Pose::translation(0.0, 0.0, 1.0)]
     }
-}
 
-impl Pendulum {
-    /// Where the tip would be drawn, m.
-    pub(super) fn tip(obs: &[f32]) -> [f64; 3] {
-        [0.0, -f64::from(obs[1]), 1.2 + f64::from(obs[0])]
+    fn camera(&self) -> Camera {
+        Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] }
+    }
+
+    /// The tip.
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        Some([0.0, -f64::from(obs[1]), 1.2 + f64::from(obs[0])])
     }
 }
 

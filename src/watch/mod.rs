@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::agent::{Agent, ImaginedTrajectory, Slot};
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
-use crate::env::scene::Body;
+use crate::env::scene::{Body, Camera};
 use crate::env::{Env, World};
 use crate::error::Result;
 use crate::files;
@@ -36,12 +36,6 @@ struct Path3 {
     points: Vec<[f64; 3]>,
     value: f64,
     spread: f64,
-}
-
-#[derive(Clone, Debug, Serialize)]
-struct Camera {
-    eye: [f64; 3],
-    target: [f64; 3],
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -91,11 +85,7 @@ impl Recording {
             }
             obs = step.observation;
         }
-        let camera = match world {
-            World::Tabletop(_) => Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] },
-            World::Pendulum(_) => Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] },
-            World::CartPole(_) => Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] },
-        };
+        let camera = world.camera();
         let spec = world.spec();
         Ok(Self { title, task: spec.name.clone(), dt: spec.dt, up: "z", camera, bodies, frames, paths })
     }
@@ -159,7 +149,7 @@ fn drawn_futures(world: &World, futures: &[ImaginedTrajectory]) -> Vec<Path3> {
     let values = || futures.iter().map(|future| f64::from(future.value)).filter(|value| value.is_finite());
     let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
     let drawn = futures.iter().filter(|future| future.value.is_finite()).map(|future| Path3 {
-        points: future.observations.iter().filter_map(|obs| world.place_of(obs)).map(|p| p.map(round)).collect(),
+        points: future.observations.iter().filter_map(|obs| world.position_of(obs)).map(|p| p.map(round)).collect(),
         value: (f64::from(future.value) - low) / (high - low).max(1e-9),
         spread: f64::from(future.disagreement),
     });

@@ -24,7 +24,7 @@ use super::arm::{ArmDescription, JointVector, Pose};
 use super::kinematics::Kinematics;
 use super::osc::{Goal, OperationalSpaceController};
 use super::physics::{CONTROL_HZ, JointState, Physics, STEPS_PER_CONTROL, TABLE_HALF, TABLE_TOP, TIMESTEP};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::{Env, Feature, KnownReward, Snapshot, Spec, Step, arm::Primitive};
 use crate::error::Result;
 use crate::rng;
@@ -326,6 +326,16 @@ impl Env for Tabletop {
         let goal = state.setup.goal.map(|goal| Pose::translation(goal.x, goal.y, goal.z));
         state.physics.arm_poses().chain([hand, table]).chain(objects).chain(goal).collect()
     }
+
+    fn camera(&self) -> Camera {
+        Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] }
+    }
+
+    /// The hand, if observations are compact.
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        let compact = self.options.observation == ObservationKind::Compact;
+        compact.then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
+    }
 }
 
 impl KnownReward for Tabletop {
@@ -350,12 +360,6 @@ impl Snapshot for Tabletop {
 }
 
 impl Tabletop {
-    /// Where the hand is (m) in a state that is observed so, if observations are compact.
-    pub(super) fn hand_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
-        let compact = self.options.observation == ObservationKind::Compact;
-        compact.then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
-    }
-
     /// Acceleration of the arm's joints over the last physics step, rad/s2.
     fn joint_acceleration(&self, joints: &JointState) -> JointVector {
         (joints.qd - self.state.measured_qd) / TIMESTEP
