@@ -21,8 +21,8 @@ const ROWS: usize = 10_240;
 const BATCH: usize = 256;
 
 fn spec() -> Spec {
-    let observation = (0..24).map(|i| Feature::new(i.to_string())).collect();
-    Spec { name: "bench".into(), observation, action_size: 4, horizon: 100, dt: 0.05, stages: vec![] }
+    let observation = (0..24).map(|i| Feature::new(i.to_string()));
+    Spec::new("bench", observation, 4, 100, 0.05)
 }
 
 /// -||next_obs[..3]||

@@ -44,13 +44,12 @@
 //!         self.x += 0.2 * action[0].clamp(-1.0, 1.0);
 //!         self.elapsed += 1;
 //!         let success = self.x.abs() < 0.1;
-//!         Ok(Step { observation: vec![self.x], reward: -self.x.abs(), terminated: false,
-//!                   truncated: self.elapsed >= self.spec.horizon, success, stage: 0 })
+//!         let truncated = self.elapsed >= self.spec.horizon;
+//!         Ok(Step::new(vec![self.x], -self.x.abs()).truncated(truncated).success(success))
 //!     }
 //! }
 //!
-//! let spec = Spec { name: "line".into(), observation: vec![Feature::new("x")], action_size: 1,
-//!                   horizon: 20, dt: 0.1, stages: vec![] };
+//! let spec = Spec::new("line", [Feature::new("x")], 1, 20, 0.1);
 //! let mut env = Line { spec, x: 0.0, elapsed: 0 };
 //! let config = SacConfig { hidden: vec![32], warm_up: 100, ..SacConfig::default() };
 //! let mut agent = Sac::new(env.spec(), config, 0)?;

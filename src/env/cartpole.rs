@@ -81,14 +81,7 @@ impl Default for CartPole {
         let observation = [("position", 1.0), ("velocity", 1.0), ("angle", 0.1), ("angular velocity", 1.0)]
             .map(|(name, scale)| Feature::new(name).around(0.0, scale));
         Self {
-            spec: Spec {
-                name: "cartpole".into(),
-                observation: observation.into(),
-                action_size: 1,
-                horizon: 200,
-                dt: DT,
-                stages: vec!["standing".into()],
-            },
+            spec: Spec::new("cartpole", observation, 1, 200, DT).stages(["standing"]),
             state: CartPoleState::new([0.0; 4]),
         }
     }
@@ -110,14 +103,9 @@ impl Env for CartPole {
         self.state.step(MAX_FORCE * f64::from(action[0]).clamp(-1.0, 1.0));
         let observation = self.state.observe();
         let terminated = self.terminated(&observation);
-        Ok(Step {
-            reward: f32::from(!terminated),
-            terminated,
-            truncated: !terminated && self.state.elapsed >= self.spec.horizon,
-            success: !terminated,
-            stage: usize::from(!terminated),
-            observation,
-        })
+        let truncated = !terminated && self.state.elapsed >= self.spec.horizon;
+        let step = Step::new(observation, f32::from(!terminated)).terminated(terminated).truncated(truncated);
+        Ok(step.success(!terminated).stage(usize::from(!terminated)))
     }
 
     fn scene(&self) -> Vec<Body> {

@@ -79,14 +79,8 @@ impl Default for Pendulum {
     fn default() -> Self {
         let speed = Feature::new("angular velocity").around(0.0, MAX_SPEED as f32);
         Self {
-            spec: Spec {
-                name: "pendulum".into(),
-                observation: vec![Feature::new("cos angle"), Feature::new("sin angle"), speed],
-                action_size: 1,
-                horizon: 200,
-                dt: DT,
-                stages: vec!["upright".into()],
-            },
+            spec: Spec::new("pendulum", [Feature::new("cos angle"), Feature::new("sin angle"), speed], 1, 200, DT)
+                .stages(["upright"]),
             state: PendulumState::new(PI, 0.0),
         }
     }
@@ -108,14 +102,9 @@ impl Env for Pendulum {
         self.spec.check_action(action)?;
         let reward = self.state.step(MAX_TORQUE * f64::from(action[0]));
         let success = self.state.upright();
-        Ok(Step {
-            observation: self.state.observe(),
-            reward: reward as f32,
-            terminated: false,
-            truncated: self.state.elapsed >= self.spec.horizon,
-            success,
-            stage: usize::from(success),
-        })
+        let truncated = self.state.elapsed >= self.spec.horizon;
+        let step = Step::new(self.state.observe(), reward as f32).truncated(truncated);
+        Ok(step.success(success).stage(usize::from(success)))
     }
 
     fn scene(&self) -> Vec<Body> {

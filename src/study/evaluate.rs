@@ -161,23 +161,23 @@ impl Evaluator {
     }
 
     fn side_by_side(&mut self, evaluation: &mut Evaluation, agent: &mut dyn Agent, seeds: &[u64]) -> Result<()> {
-        let dt = self.worlds.envs()[0].spec().dt;
-        let mut observations = self.worlds.reset(seeds);
+        let dt = self.worlds.env(0).spec().dt;
+        let mut observations = self.worlds.reset(seeds)?;
         let mut paths: Vec<Vec<[f64; 3]>> =
-            self.worlds.envs().iter().take(seeds.len()).map(|world| world.hand().into_iter().collect()).collect();
+            self.worlds.envs().take(seeds.len()).map(|world| world.hand().into_iter().collect()).collect();
         let blank = EpisodeResult { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
         let mut results = vec![blank; seeds.len()];
         let mut running: Vec<usize> = (0..seeds.len()).collect();
         let starts = observations.iter().map(|obs| Episode { observations: vec![obs.clone()], ..Episode::default() });
         let mut recorded: Vec<Episode> = starts.collect();
-        let slot = Slot { index: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
+        let slot = Slot { index: 0, first: true, obs: &observations[0], world: self.worlds.env(0) };
         evaluation.action_ms = time_of_action(agent, slot);
         let mut first = true;
         while !running.is_empty() {
-            let envs = self.worlds.envs();
-            let slots = running.iter().map(|&i| Slot { index: i, first, obs: &observations[i], world: &envs[i] });
+            let slots =
+                running.iter().map(|&i| Slot { index: i, first, obs: &observations[i], world: self.worlds.env(i) });
             let slots: Vec<Slot> = slots.collect();
-            let mut actions = vec![None; seeds.len()];
+            let mut actions = vec![None; self.worlds.len()];
             for (&i, action) in running.iter().zip(agent.act_all(&slots)) {
                 actions[i] = Some(action);
             }
@@ -189,7 +189,7 @@ impl Evaluator {
                 result.success = step.success;
                 result.length += 1;
                 result.stage = result.stage.max(step.stage);
-                paths[i].extend(self.worlds.envs()[i].hand());
+                paths[i].extend(self.worlds.env(i).hand());
                 recorded[i].observations.push(step.observation.clone());
                 recorded[i].actions.extend(actions[i].clone());
                 recorded[i].rewards.push(step.reward);

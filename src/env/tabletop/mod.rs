@@ -129,18 +129,14 @@ impl Tabletop {
             compact: Vec::new(),
             physics: empty.clone(),
         };
+        let action_size = match options.action {
+            ActionKind::Hand => 4,
+            ActionKind::Pose => 7,
+        };
+        let horizon = options.horizon.unwrap_or(task.horizon());
         let mut tabletop = Self {
-            spec: Spec {
-                name: task.name().into(),
-                observation: Vec::new(),
-                action_size: match options.action {
-                    ActionKind::Hand => 4,
-                    ActionKind::Pose => 7,
-                },
-                horizon: options.horizon.unwrap_or(task.horizon()),
-                dt: 1.0 / CONTROL_HZ,
-                stages: task.stages().iter().map(ToString::to_string).collect(),
-            },
+            spec: Spec::new(task.name(), [], action_size, horizon, 1.0 / CONTROL_HZ)
+                .stages(task.stages().iter().copied()),
             home_orientation: goal.orientation,
             options,
             task,
@@ -283,14 +279,9 @@ impl Env for Tabletop {
         self.state.elapsed += 1;
         let observation = self.observe();
         let outcome = self.task.outcome(&self.state.compact);
-        Ok(Step {
-            observation,
-            reward: self.reward_of(outcome),
-            terminated: false,
-            truncated: self.state.elapsed >= self.spec.horizon,
-            success: outcome.success,
-            stage: outcome.stage,
-        })
+        let truncated = self.state.elapsed >= self.spec.horizon;
+        let step = Step::new(observation, self.reward_of(outcome)).truncated(truncated);
+        Ok(step.success(outcome.success).stage(outcome.stage))
     }
 
     fn hand(&self) -> Option<[f64; 3]> {
