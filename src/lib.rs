@@ -14,6 +14,7 @@
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
 //! | 0 | [`env`](mod@env) | worlds to act in: the arm at its table, pendulum, cart-pole |
 //! | 0 | [`diff`] | simulators that can be differentiated, and trajectories optimised with their gradients |
+//! | 0 | [`checkpoint`] | named arrays in safetensors files: weights, and all that training needs to resume |
 //! | 0 | [`rng`], [`files`], [`error`] | random numbers, files that are written whole, what can go wrong |
 //!
 //! What holds everywhere:
@@ -69,6 +70,7 @@
 pub mod agent;
 #[cfg(feature = "figures")]
 pub mod chart;
+pub mod checkpoint;
 pub mod diff;
 pub mod env;
 pub mod error;
