@@ -4,7 +4,7 @@ use super::{Agent, Checkpoint, Mode};
 use crate::env::tabletop::{ObservationKind, TableOptions};
 use crate::env::{Spec, Task};
 use crate::error::{Error, Result};
-use crate::nn::Weights;
+use crate::checkpoint::Weights;
 use crate::rng::{self, Rng};
 
 /// Uniform random actions.

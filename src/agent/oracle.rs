@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::{Checkpoint, Policy, Slot, Slots};
 use crate::env::{Env, Snapshot};
 use crate::error::{Error, Result};
-use crate::nn::Weights;
+use crate::checkpoint::Weights;
 use crate::plan::{ActionSequences, ControlConfig, IcemConfig, MakePlanner, PlannerConfig, RecedingHorizon};
 use crate::rng::{self, Rng};
 

@@ -16,7 +16,7 @@ use crate::model::uncertainty::Risk;
 use crate::model::{
     Differentiable, Dynamics, Ensemble, EnsembleConfig, Imagination, ImaginedReturns, Propagation, Reward, Value,
 };
-use crate::nn::Weights;
+use crate::checkpoint::Weights;
 use crate::plan::{
     ActionSequences, ControlConfig, IcemConfig, Iteration, Objective, PlanObserver, PlannerConfig, RecedingHorizon,
 };

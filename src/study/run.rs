@@ -20,7 +20,7 @@ use crate::env::contract::Checked;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::model::open_loop::OpenLoop;
-use crate::nn::Weights;
+use crate::checkpoint::Weights;
 use crate::replay::Transition;
 
 /// A checkpoint is due after this long.

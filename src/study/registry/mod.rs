@@ -34,7 +34,7 @@ use super::run::Run;
 use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, merge, preset_table, specialise};
 use crate::env::Env;
 use crate::error::{Error, Result};
-use crate::nn::Weights;
+use crate::checkpoint::Weights;
 
 /// Environments, agents and presets by name.
 pub struct Registry {
