@@ -105,6 +105,12 @@ impl Clone for Physics {
     }
 }
 
+impl std::fmt::Debug for Physics {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.debug_struct("Physics").field("joints", &self.joint_state()).finish_non_exhaustive()
+    }
+}
+
 impl Physics {
     /// A table with `arm` beside it, at its home posture.
     pub fn new(arm: ArmDescription) -> Self {
