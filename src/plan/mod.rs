@@ -14,7 +14,6 @@ mod icem;
 mod mppi;
 pub mod noise;
 mod shooting;
-mod simulated;
 
 pub use cem::{Cem, CemConfig};
 pub use control::{ControlConfig, RecedingHorizon};
@@ -23,7 +22,6 @@ pub use hybrid::{Hybrid, HybridConfig};
 pub use icem::{Icem, IcemConfig};
 pub use mppi::{Mppi, MppiConfig};
 pub use shooting::{RandomShooting, ShootingConfig};
-pub use simulated::Simulated;
 
 use serde::{Deserialize, Serialize};
 
