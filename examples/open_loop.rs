@@ -24,8 +24,8 @@ const TRAINING: u64 = 60;
 const HELD_OUT: u64 = 20;
 /// Gradient steps of each model.
 const STEPS: usize = 4000;
-/// Weight of the scripted policy in an action, episode by episode in turn; the rest is noise.
-const SKILL: [f64; 3] = [1.0, 0.7, 0.0];
+/// Weight of the scripted policy's action, for one episode after the other; noise has 1.2 minus that.
+const POLICY_WEIGHTS: [f64; 3] = [1.0, 0.7, 0.0];
 
 /// Episodes of the scripted policy, of the policy with noise, and of noise alone.
 struct Dataset {
@@ -45,7 +45,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Data
         sequences: SequenceReplay::new(size, action_size, usize::MAX),
     };
     for seed in seeds {
-        let skill = SKILL[seed as usize % SKILL.len()];
+        let weight = POLICY_WEIGHTS[seed as usize % POLICY_WEIGHTS.len()];
         let noise = ColoredNoise::new(2.0, horizon).sample_actions(action_size, rng);
         let mut obs = world.reset(seed);
         let mut episode = Episode { observations: vec![obs.clone()], ..Episode::default() };
@@ -53,7 +53,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Data
             let mixed = policy(&obs)
                 .into_iter()
                 .zip(noise)
-                .map(|(scripted, noise)| skill * f64::from(scripted) + (1.2 - skill) * noise);
+                .map(|(scripted, noise)| weight * f64::from(scripted) + (1.2 - weight) * noise);
             let action: Vec<f32> = mixed.map(|a| a.clamp(-1.0, 1.0) as f32).collect();
             let step = world.step(&action)?;
             episode.actions.push(action.clone());
@@ -79,7 +79,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Data
     Ok(dataset)
 }
 
-/// A row of the table.
+/// A row of `TASK.csv`: see [`handful::model::open_loop::OpenLoop`].
 #[derive(serde::Serialize)]
 struct Row {
     model: &'static str,

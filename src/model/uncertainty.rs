@@ -172,9 +172,9 @@ mod tests {
         let (means, variances) = (vec![vec![0.3, 0.1]; 4], vec![vec![0.2, 0.5]; 4]);
         near(jensen_renyi(&means, &variances), 0.0);
         near(mutual_information(&means, &variances), 0.0);
-        // Far apart in a hundred dimensions, where a product of densities underflows.
-        let apart = [vec![0.0; 100], vec![100.0; 100]];
-        let found = jensen_renyi(&apart, &vec![vec![1e-4; 100]; 2]);
+        // Distant means in a hundred dimensions, where a product of densities underflows.
+        let distant = [vec![0.0; 100], vec![100.0; 100]];
+        let found = jensen_renyi(&distant, &vec![vec![1e-4; 100]; 2]);
         near(found, 2.0_f64.ln());
     }
 

@@ -84,8 +84,8 @@ impl Cube {
     /// features, and their standard deviations.
     pub(super) fn decanonicalize(&self, symmetry: Symmetry, obs: &[f32], changes: &mut [f32], stds: &mut [f32]) {
         let [x, y, z] = symmetry.permute(&axes(&obs[self.observed..]));
-        let of = |numbers: &[f32]| -> [[f32; 3]; 2] {
-            [0, 3].map(|from| std::array::from_fn(|i| numbers[self.predicted + from + i]))
+        let of = |features: &[f32]| -> [[f32; 3]; 2] {
+            [0, 3].map(|from| std::array::from_fn(|i| features[self.predicted + from + i]))
         };
         let [[dx, dz], [sx, sz]] = [of(changes), of(stds)];
         // The third axis follows from the other two; its standard deviation to first order.
@@ -138,12 +138,12 @@ mod tests {
     const CUBE: Cube = Cube { observed: 0, predicted: 0 };
 
     fn random_rotation(rng: &mut rng::Rng) -> Rotation3<f64> {
-        let turn = UnitQuaternion::from_scaled_axis(Vector3::from_fn(|_, _| 2.0 * rng::normal(rng)));
-        turn.to_rotation_matrix()
+        let rotation = UnitQuaternion::from_scaled_axis(Vector3::from_fn(|_, _| 2.0 * rng::normal(rng)));
+        rotation.to_rotation_matrix()
     }
 
-    fn observed(turn: &Rotation3<f64>) -> [f32; 6] {
-        let (x, z) = (turn * Vector3::x(), turn * Vector3::z());
+    fn observed(rotation: &Rotation3<f64>) -> [f32; 6] {
+        let (x, z) = (rotation * Vector3::x(), rotation * Vector3::z());
         std::array::from_fn(|i| if i < 3 { x[i] } else { z[i - 3] } as f32)
     }
 
@@ -153,14 +153,14 @@ mod tests {
         let mut rng = rng::stream(0, "cube");
         let quarter = |axis| Rotation3::from_axis_angle(&axis, std::f64::consts::FRAC_PI_2);
         for _ in 0..50 {
-            let mut turn = random_rotation(&mut rng);
-            let mut canonical = observed(&turn);
+            let mut rotation = random_rotation(&mut rng);
+            let mut canonical = observed(&rotation);
             CUBE.apply(CUBE.to_canonical(&canonical), &mut canonical);
             assert!(canonical[5] > 0.57 && canonical[0] > 0.0, "z up and x ahead: {canonical:?}");
             for i in 0..24 {
-                turn *= quarter(if i % 4 == 3 { Vector3::x_axis() } else { Vector3::z_axis() });
-                turn *= quarter(if i % 3 == 1 { Vector3::y_axis() } else { Vector3::z_axis() });
-                let mut other = observed(&turn);
+                rotation *= quarter(if i % 4 == 3 { Vector3::x_axis() } else { Vector3::z_axis() });
+                rotation *= quarter(if i % 3 == 1 { Vector3::y_axis() } else { Vector3::z_axis() });
+                let mut other = observed(&rotation);
                 CUBE.apply(CUBE.to_canonical(&other), &mut other);
                 assert!(canonical.iter().zip(&other).all(|(a, b)| (a - b).abs() < 1e-5), "{canonical:?} {other:?}");
             }
@@ -174,8 +174,8 @@ mod tests {
         let predicted = (0..6).collect();
         let map = FeatureMap { width: 6, raw: vec![], near: vec![], predicted, differences: vec![], cubes: vec![CUBE] };
         for _ in 0..50 {
-            let turn = random_rotation(&mut rng);
-            let straight = observed(&turn);
+            let rotation = random_rotation(&mut rng);
+            let straight = observed(&rotation);
             let mut bent = straight.map(|a| 1.2 * a + 0.02 * rng::normal(&mut rng) as f32);
             map.recompute_derived(&mut bent);
             let [x, z] = [0, 3].map(|from| Vector3::from_fn(|i, _| f64::from(bent[from + i])));
@@ -193,9 +193,9 @@ mod tests {
     fn predictions_are_decanonicalized() {
         let mut rng = rng::stream(1, "cube");
         for _ in 0..200 {
-            let turn = random_rotation(&mut rng);
+            let rotation = random_rotation(&mut rng);
             let by = UnitQuaternion::from_scaled_axis(Vector3::from_fn(|_, _| 0.1 * rng::normal(&mut rng)));
-            let (before, after) = (observed(&turn), observed(&(by.to_rotation_matrix() * turn)));
+            let (before, after) = (observed(&rotation), observed(&(by.to_rotation_matrix() * rotation)));
             let symmetry = CUBE.to_canonical(&before);
             let [mut from, mut to] = [before, after];
             CUBE.apply(symmetry, &mut from);

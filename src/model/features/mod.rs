@@ -1,4 +1,4 @@
-//! Feature maps: which numbers of an observation networks read and predict, and on which scale.
+//! Feature maps: which features of an observation networks read and predict, and on which scale.
 //!
 //! [`FeatureMap`] serves the ensembles, [`LatentFeatures`] the latent models (autoencoder and RSSM). Both read the
 //! [`crate::env::Role`] of each feature: `Dynamic` features are predicted, `Constant` ones (a goal) are not, and a
