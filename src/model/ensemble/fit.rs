@@ -70,6 +70,10 @@ impl Ensemble {
     ///
     /// # Panics
     /// If there are fewer than two transitions.
+    #[doc(alias = "negative log-likelihood")]
+    #[doc(alias = "early stopping")]
+    #[doc(alias = "bootstrap")]
+    #[doc(alias = "train")]
     pub fn fit(&mut self, replay: &ReplayBuffer, rng: &mut Rng) -> Fit {
         let data = self.normalised(replay);
         let mut order: Vec<usize> = (0..data.rows).collect();

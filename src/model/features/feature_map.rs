@@ -101,7 +101,9 @@ impl FeatureMap {
     }
 
     /// Recomputes what follows from the predicted features of an observation: differences, and the axes of each cube,
-    /// which are [orthonormalized](Cube).
+    /// which are orthonormalized (Gram-Schmidt).
+    #[doc(alias = "Gram-Schmidt")]
+    #[doc(alias = "orthonormalize")]
     pub fn recompute_derived(&self, obs: &mut [f32]) {
         for &[i, a, b] in &self.differences {
             obs[i] = obs[a] - obs[b];

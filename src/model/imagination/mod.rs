@@ -86,6 +86,7 @@ pub enum Propagation {
     /// MM, moment matching: particles are drawn from a Gaussian with mean and variance of the ensemble, then resampled at
     /// every time step from a Gaussian with independent components fitted to a candidate's particles.
     #[doc(alias = "MM")]
+    #[doc(alias = "distribution sampling")]
     MomentMatching,
 }
 
@@ -166,11 +167,14 @@ impl Imagination<'_> {
     }
 
     /// Returns of the candidates `actions` (`[candidates, horizon, action]`), starting from `obs`: one observation, or one
-    /// for each candidate (`[candidates, observation]`). Candidates are distributed over threads.
+    /// for each candidate (`[candidates, observation]`). Candidates share their random numbers, and are distributed over
+    /// threads.
     ///
     /// # Panics
     /// If the sizes do not fit together, the particles are not a multiple of the members, or the reward is
     /// [`Reward::Learned`] and the model has not learned rewards.
+    #[doc(alias = "CRN")]
+    #[doc(alias = "common random numbers")]
     pub fn imagined_returns(&self, obs: &[f32], actions: &[f32], horizon: usize, rng: &mut Rng) -> ImaginedReturns {
         let width = horizon * self.dynamics.action_size();
         let (count, particles) = (actions.len() / width, self.particles());
