@@ -196,7 +196,7 @@ impl Objective for EnsembleObjective<'_> {
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         let Imagination { dynamics, reward, .. } = self.imagination;
         let model = self.differentiable.get_or_insert_with(|| Differentiable::new(dynamics));
-        let disagreement_penalty = if let Risk::Deviation(weight) = self.risk { weight } else { -self.disagreement };
+        let disagreement_penalty = if let Risk::MeanStd(weight) = self.risk { weight } else { -self.disagreement };
         model.gradients(reward, self.obs, &sequences.values, sequences.horizon, disagreement_penalty)
     }
 }

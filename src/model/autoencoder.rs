@@ -5,8 +5,8 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
+use super::features::LatentFeatures;
 use super::open_loop::{Episode, OpenLoopModel, actions_from};
-use super::view::LatentFeatures;
 use crate::env::Spec;
 use crate::nn::ops::{self, record};
 use crate::nn::{Adam, Grad, Mlp, Tensor3, device, parameters_of_fields, tensor};
@@ -60,12 +60,12 @@ impl Autoencoder {
 
     /// The codes of observations, in rows: `[1, rows, code]`.
     pub fn encode(&self, obs: &[f32]) -> Tensor3 {
-        self.encoder.forward(self.view.seen(&self.cpu, obs), Grad::Input)
+        self.encoder.forward(self.view.encode(&self.cpu, obs), Grad::Input)
     }
 
     /// The observations of codes, in rows.
     pub fn decode(&self, codes: &Tensor3) -> Vec<f32> {
-        self.view.told(&self.decoder.forward(codes.clone(), Grad::Input))
+        self.view.decode(&self.decoder.forward(codes.clone(), Grad::Input))
     }
 
     /// The codes after `actions` (`[1, rows, actions]`).
@@ -81,7 +81,7 @@ impl Autoencoder {
     pub fn learn(&mut self, batch: &SequenceBatch, optimiser: &mut Adam) -> f32 {
         let rows = batch.sequences;
         let (width, size) = (batch.actions.len() / (rows * batch.length), batch.obs.len() / (rows * batch.length));
-        let at = |t: usize| self.view.seen(&self.cpu, &batch.obs[t * rows * size..][..rows * size]);
+        let at = |t: usize| self.view.encode(&self.cpu, &batch.obs[t * rows * size..][..rows * size]);
         let mut tape = OwnedTape::default();
         let mut codes = record(&mut tape, &at(0), |obs| self.encoder.forward(obs, Grad::Params));
         let mut counts = vec![1.0; rows];
@@ -107,8 +107,8 @@ impl Autoencoder {
 }
 
 impl OpenLoopModel for Autoencoder {
-    fn predicted(&self) -> Vec<(usize, f32)> {
-        self.view.lively()
+    fn predicted_features(&self) -> Vec<(usize, f32)> {
+        self.view.evaluated()
     }
 
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, _rng: &mut Rng) -> Vec<Vec<f32>> {

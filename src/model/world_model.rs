@@ -5,9 +5,9 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
+use super::features::LatentFeatures;
 use super::open_loop::{Episode, OpenLoopModel, actions_from};
 use super::rssm::{Latent, Rssm, RssmConfig};
-use super::view::LatentFeatures;
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::nn::categorical::Side;
@@ -164,7 +164,7 @@ impl WorldModel {
 
     /// What is believed after `action` (`[1, rows, actions]`) has led to `obs`, in rows.
     pub fn observe(&self, before: &Latent, action: &Tensor3, obs: &[f32], rng: &mut Rng) -> Latent {
-        let token = self.encoder.forward(self.view.seen(&self.cpu, obs), Grad::Input);
+        let token = self.encoder.forward(self.view.encode(&self.cpu, obs), Grad::Input);
         self.rssm.observe(&mut NoneTape, before, action, &token, rng).0
     }
 
@@ -175,7 +175,7 @@ impl WorldModel {
 
     /// The observations that go with features, in physical units, row by row.
     pub fn decode(&self, features: &Tensor3) -> Vec<f32> {
-        self.view.told(&self.decoder.forward(features.clone(), Grad::Input))
+        self.view.decode(&self.decoder.forward(features.clone(), Grad::Input))
     }
 
     /// The rewards for having arrived where the features say.
@@ -191,7 +191,7 @@ impl WorldModel {
 
     /// How wrong the model is about a batch of experience; everything is recorded on `tape`.
     pub fn loss<T: Tape<f32, Cpu>>(&self, tape: &mut T, batch: &SequenceBatch, rng: &mut Rng) -> WorldModelLoss {
-        let seen = self.view.seen(&self.cpu, &batch.obs);
+        let seen = self.view.encode(&self.cpu, &batch.obs);
         let (latent, logits) = self.observe_sequence(tape, batch, &seen, rng);
         let expected = self.rssm.prior(tape, &latent.deter);
         let features = record(tape, &latent.deter, |memory| ops::join(memory, latent.stoch.clone()));
@@ -285,8 +285,8 @@ impl WorldModel {
 }
 
 impl OpenLoopModel for WorldModel {
-    fn predicted(&self) -> Vec<(usize, f32)> {
-        self.view.lively()
+    fn predicted_features(&self) -> Vec<(usize, f32)> {
+        self.view.evaluated()
     }
 
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
