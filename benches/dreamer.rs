@@ -1,21 +1,19 @@
 //! Dreamer's updates at the published smallest size and in the small preset, and its actions: observation 24, action 4.
 
 use std::hint::black_box;
-use std::path::Path;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use handful::agent::{Dreamer, DreamerConfig};
 use handful::prelude::*;
 use handful::rng;
-use handful::study::config::RunConfig;
 
 /// As in the program itself.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn agent(config: DreamerConfig) -> Dreamer {
-    let observation = (0..24).map(|i| Feature::new(i.to_string())).collect();
-    let spec = Spec { name: "bench".into(), observation, action_size: 4, horizon: 100, dt: 0.05, stages: vec![] };
+    let observation = (0..24).map(|i| Feature::new(i.to_string()));
+    let spec = Spec::new("bench", observation, 4, 100, 0.05);
     let mut agent = Dreamer::new(&spec, config, 0).expect("usable settings");
     let mut rng = rng::stream(0, "bench");
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| rng::normal(&mut rng) as f32).collect() };
@@ -34,8 +32,7 @@ fn agent(config: DreamerConfig) -> Dreamer {
 
 /// The settings of the preset.
 fn preset() -> DreamerConfig {
-    let config = RunConfig::new(Task::Reach, "dreamer", 0, None, None::<&Path>).expect("a preset");
-    config.dreamer.expect("settings of Dreamer")
+    DreamerConfig::preset_for("dreamer", "reach").expect("a preset")
 }
 
 fn updates(c: &mut Criterion) {

@@ -10,7 +10,7 @@ use handful::nn::kernels::{Matrix, matmul};
 use handful::plan::{CemConfig, PlannerConfig};
 use handful::prelude::*;
 use handful::rng::{self, Rng};
-use handful::study::config::RunConfig;
+
 use rayon::prelude::*;
 
 /// As in the program itself.
@@ -21,8 +21,8 @@ const ROWS: usize = 10_240;
 const BATCH: usize = 256;
 
 fn spec() -> Spec {
-    let observation = (0..24).map(|i| Feature::new(i.to_string())).collect();
-    Spec { name: "bench".into(), observation, action_size: 4, horizon: 100, dt: 0.05, stages: vec![] }
+    let observation = (0..24).map(|i| Feature::new(i.to_string()));
+    Spec::new("bench", observation, 4, 100, 0.05)
 }
 
 /// -||next_obs[..3]||
@@ -49,7 +49,7 @@ fn data(rng: &mut Rng) -> ReplayBuffer {
 
 fn pets(spec: &Spec, reward: Arc<dyn KnownReward + Send + Sync>, config: PetsConfig) -> Pets {
     let mut rng = rng::stream(0, "bench");
-    let mut agent = Pets::new(spec, reward, config, 0).expect("usable settings");
+    let mut agent = Pets::new(spec, Some(reward), config, 0).expect("usable settings");
     (0..1000).for_each(|_| agent.observe(&transition(&mut rng, spec.observation_size(), spec.action_size)));
     agent.fit();
     agent
@@ -81,7 +81,7 @@ fn plans(c: &mut Criterion) {
     }
     group.throughput(Throughput::Elements(1));
     for task in [Task::Reach, Task::Push, Task::Lift, Task::Pendulum] {
-        let mut config = RunConfig::new(task, "pets", 0, None, None).expect("a preset").pets.expect("PETS's settings");
+        let mut config = PetsConfig::preset_for("pets", task.name()).expect("a preset");
         config.ensemble.first_steps = 20;
         let world = task.make();
         let spec = world.spec().clone();

@@ -12,8 +12,8 @@ use handful::rng;
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn agent(config: SacConfig) -> Sac {
-    let observation = (0..24).map(|i| Feature::new(i.to_string())).collect();
-    let spec = Spec { name: "bench".into(), observation, action_size: 4, horizon: 100, dt: 0.05, stages: vec![] };
+    let observation = (0..24).map(|i| Feature::new(i.to_string()));
+    let spec = Spec::new("bench", observation, 4, 100, 0.05);
     let mut agent = Sac::new(&spec, config, 0).expect("usable settings");
     let mut rng = rng::stream(0, "bench");
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| rng::normal(&mut rng) as f32).collect() };

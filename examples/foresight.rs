@@ -6,7 +6,7 @@
 use std::error::Error;
 use std::path::Path;
 
-use handful::agent::DreamerConfig;
+use handful::agent::{DreamerConfig, Preset};
 use handful::env::{Env, Spec, Task, World};
 use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
 use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, WorldModel};
@@ -14,7 +14,7 @@ use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
 use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng::{self, Rng};
-use handful::study::config::RunConfig;
+
 use plotters::prelude::*;
 
 const TRAINING: u64 = 60;
@@ -130,7 +130,7 @@ fn study(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     judge("autoencoder", &autoencoder, spec, &held_out, &mut rows);
 
     let DreamerConfig { world: config, learning_rate, batch, length, .. } =
-        RunConfig::new(task, "dreamer", 0, None, None)?.dreamer.ok_or("settings of Dreamer")?;
+        DreamerConfig::preset_for("dreamer", task.name())?;
     let mut rssm = WorldModel::new(spec, &config, &mut rng);
     let mut optimiser = Adam::new(AdamConfig { warm_up: 100, ..AdamConfig::laprop(learning_rate) });
     for _ in 0..STEPS {

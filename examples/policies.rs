@@ -4,7 +4,6 @@
 //! `cargo run --example policies` (three minutes).
 
 use std::error::Error;
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use handful::agent::Mode;
@@ -12,7 +11,7 @@ use handful::diff::{AnalyticPolicyGradient, PendulumSwing, PolicySearchConfig};
 use handful::env::pendulum::Pendulum;
 use handful::prelude::*;
 use handful::rng;
-use handful::study::config::RunConfig;
+
 use nalgebra::SVector;
 use plotters::prelude::*;
 
@@ -69,8 +68,8 @@ fn by_gradients(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
 
 fn by_sac(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
     const STEPS: usize = 10_000;
-    let mut agent = RunConfig::new(Task::Pendulum, "sac", seed, None, None::<&Path>)?.agent()?;
     let mut world = Pendulum::default();
+    let mut agent = Sac::new(world.spec(), SacConfig::preset_for("sac", "pendulum")?, seed)?;
     let mut obs = world.reset(seed << 20);
     let mut spent = Duration::ZERO;
     let mut episodes = 1;

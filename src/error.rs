@@ -28,6 +28,14 @@ pub enum Error {
         /// What is wrong with the action.
         problem: String,
     },
+    /// An environment that breaks the contract of [`crate::env::Env`].
+    #[error("{env} breaks the contract of an environment: {rule}")]
+    Contract {
+        /// The environment.
+        env: String,
+        /// The rule that was broken, and at which step of the episode.
+        rule: String,
+    },
     /// A setting with an unusable value.
     #[error("{0}")]
     BadSetting(String),

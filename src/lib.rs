@@ -1,32 +1,40 @@
 //! Model-based reinforcement learning in Rust, on a robot arm that has to move things with its hand.
 //!
-//! A map of the house. A floor uses only the floors below it.
+//! # Train and evaluate
 //!
-//! | floor | module | what lives there |
-//! | --- | --- | --- |
-//! | 3 | [`study`] | runs, the protocol by which agents are judged, tables, figures, reports |
-//! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
-//! | 3 | `chart` | charts for chapters and examples (feature `figures`) |
-//! | 2 | [`agent`] | agents: the wiring of what stands below |
-//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradients: optimisers of a closure over action sequences |
-//! | 1 | [`model`] | what was learned of the world: probabilistic ensembles, latent worlds, and imagination in both |
-//! | 1 | [`replay`] | what was experienced |
-//! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
-//! | 0 | [`env`](mod@env) | worlds to act in: the arm at its table, pendulum, cart-pole |
-//! | 0 | [`diff`] | simulators that can be differentiated, and trajectories optimised with their gradients |
-//! | 0 | [`checkpoint`] | named arrays in safetensors files: weights, and all that training needs to resume |
-//! | 0 | [`rng`], [`files`], [`error`] | random numbers, files that are written whole, what can go wrong |
+//! An [`agent::Agent`] acts, observes and updates; an [`env::Env`] is reset and stepped; an
+//! [`study::evaluate::Evaluator`] measures any agent in any environment by one protocol.
 //!
-//! What holds everywhere:
-//! - Agents know an environment by the trait [`env::Env`] alone; so does the study. The one exception is the
-//!   oracle, which plans on the true world and says so.
-//! - A planner never sees an environment: it maximises a closure.
-//! - No global state: every random number comes from a generator that was passed in, and one seed
-//!   fixes a run bit for bit on one machine.
-//! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
-//! - Libraries return [`error::Error`]s; a panic is a bug.
+//! ```
+//! use handful::prelude::*;
 //!
-//! # An agent on an environment of your own
+//! let mut env = Task::Pendulum.make();
+//! let config = SacConfig { hidden: vec![32], warm_up: 100, ..SacConfig::preset("sac")? };
+//! let mut agent = Sac::new(env.spec(), config, 0)?;
+//! let mut obs = env.reset(0);
+//! agent.begin_episode();
+//! for seed in 1..=300 {
+//!     let action = agent.act(&obs, Mode::Explore);
+//!     let Step { observation, reward, terminated, truncated, .. } = env.step(&action)?;
+//!     agent.observe(&Transition { obs, action, reward, next_obs: observation.clone(), terminated, truncated });
+//!     agent.update();
+//!     obs = observation;
+//!     if terminated || truncated {
+//!         obs = env.reset(seed);
+//!         agent.begin_episode();
+//!     }
+//! }
+//! let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make()))?;
+//! let summary = evaluator.evaluate(&mut agent, 10, EvalSeeds::Test)?.summary();
+//! assert!(summary.return_mean < 0.0 && summary.episodes == 10);
+//! # Ok::<(), handful::error::Error>(())
+//! ```
+//!
+//! # Bring an environment of your own
+//!
+//! Implement [`env::Env`]; every agent trains on it and the evaluator measures it. With [`env::KnownReward`] PETS need
+//! not learn the reward, with [`env::Snapshot`] the oracle plans in it, and with a [`study::registry::Registry`] it
+//! enters the command line: train, resume, evaluate, study, report, watch. `examples/own_world.rs` shows all of it.
 //!
 //! ```
 //! use handful::prelude::*;
@@ -44,33 +52,53 @@
 //!         self.spec.check_action(action)?;
 //!         self.x += 0.2 * action[0].clamp(-1.0, 1.0);
 //!         self.elapsed += 1;
-//!         let success = self.x.abs() < 0.1;
-//!         Ok(Step { observation: vec![self.x], reward: -self.x.abs(), terminated: false,
-//!                   truncated: self.elapsed >= self.spec.horizon, success, stage: 0 })
+//!         let step = Step::new(vec![self.x], -self.x.abs());
+//!         Ok(step.success(self.x.abs() < 0.1).truncated(self.elapsed >= self.spec.horizon))
 //!     }
 //! }
 //!
-//! let spec = Spec { name: "line".into(), observation: vec![Feature::new("x")], action_size: 1,
-//!                   horizon: 20, dt: 0.1, stages: vec![] };
-//! let mut env = Line { spec, x: 0.0, elapsed: 0 };
-//! let config = SacConfig { hidden: vec![32], warm_up: 100, ..SacConfig::default() };
-//! let mut agent = Sac::new(env.spec(), config, 0)?;
-//! let mut obs = env.reset(0);
-//! for i in 1..=300 {
-//!     let action = agent.act(&obs, Mode::Explore);
-//!     let Step { observation, reward, terminated, truncated, .. } = env.step(&action)?;
-//!     agent.observe(&Transition { obs, action, reward, next_obs: observation.clone(), terminated, truncated });
-//!     agent.update();
-//!     obs = if terminated || truncated { env.reset(i) } else { observation };
-//! }
+//! let make = || Ok(Line { spec: Spec::new("line", vec![Feature::new("x")], 1, 20, 0.1), x: 0.0, elapsed: 0 });
+//! let mut homing = Scripted::new(|obs| vec![(-5.0 * obs[0]).clamp(-1.0, 1.0)]);
+//! let summary = Evaluator::new(make)?.evaluate(&mut homing, 20, EvalSeeds::Test)?.summary();
+//! assert_eq!(summary.success, 1.0);
 //! # Ok::<(), handful::error::Error>(())
 //! ```
+//!
+//! # A map of the crate
+//!
+//! A module uses only its own floor and the floors below it; a test holds that.
+//!
+//! | floor | module | what is in it |
+//! | --- | --- | --- |
+//! | 4 | `cli` | the command line, for any registry (feature `cli`) |
+//! | 3 | [`study`] | evaluation protocol, runs, registry, statistics, tables, figures, reports |
+//! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
+//! | 2 | [`agent`] | agents: the wiring of what is below |
+//! | 2 | [`diff`] | differentiable simulators, iLQR, analytic policy gradients, system identification |
+//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradient ascent; receding-horizon control |
+//! | 1 | [`model`] | learned models: probabilistic ensembles, latent world models, imagination in both |
+//! | 1 | [`replay`] | transitions, episodes, replay buffers |
+//! | 0 | [`env`](mod@env) | environments: the arm at its table, pendulum, cart-pole |
+//! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
+//! | 0 | [`checkpoint`] | named arrays in safetensors files: weights, and all that training needs to resume |
+//! | 0 | [`rng`], [`files`], [`error`] | random numbers, files that are written whole, errors |
+//! | 0 | `chart` | charts for chapters, examples and reports (feature `figures`) |
+//!
+//! What holds everywhere:
+//! - Agents, evaluation, runs, replays and the study know an environment by its traits alone.
+//! - A planner never sees an environment: it maximises a closure.
+//! - No global state: every random number comes from a generator that was passed in, and one seed
+//!   fixes a run bit for bit on one machine.
+//! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
+//! - Libraries return [`error::Error`]s; a panic is a bug.
 #![warn(missing_docs)]
 
 pub mod agent;
 #[cfg(feature = "figures")]
 pub mod chart;
 pub mod checkpoint;
+#[cfg(feature = "cli")]
+pub mod cli;
 pub mod diff;
 pub mod env;
 pub mod error;
@@ -86,12 +114,19 @@ pub mod watch;
 /// What most programs that use this crate need.
 pub mod prelude {
     pub use crate::agent::{
-        Agent, Losses, Mode, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted, Slot,
+        Agent, Checkpoint, Diagnostics, Dreamer, DreamerConfig, Losses, Method, Mode, Oracle, OracleConfig, Pets,
+        PetsConfig, Policy, Preset, Random, Sac, SacConfig, Scripted, Slot, Slots,
     };
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};
     pub use crate::error::{Error, Result};
+    pub use crate::model::{Ensemble, EnsembleConfig, Imagination, Propagation, WorldModel, WorldModelConfig};
+    pub use crate::plan::{
+        ActionSequences, CemConfig, ControlConfig, IcemConfig, MppiConfig, Objective, Planner, PlannerConfig,
+        RecedingHorizon,
+    };
     pub use crate::replay::{ReplayBuffer, Transition};
     pub use crate::study::evaluate::{EvalSeeds, Evaluator};
+    pub use crate::study::registry::{EnvEntry, NoOptions, Registry};
 }

@@ -1,22 +1,28 @@
 //! Agents learn what they should, and a run that was stopped goes on as if it had not been.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use handful::agent::dreamer::ActorCriticConfig;
-use handful::agent::{Agent, Mode, Sac, SacConfig, Slot};
-use handful::env::{Env, Step, Task, World};
-use handful::error::Error;
+use handful::agent::{
+    Agent, Diagnostics, Dreamer, DreamerConfig, Mode, Oracle, OracleConfig, Pets, PetsConfig, Policy, Preset, Sac,
+    SacConfig, Slot,
+};
+use handful::env::{Env, Snapshot, Step, Task, World};
+use handful::error::{Error, Result};
 use handful::model::{EnsembleConfig, RssmConfig, WorldModelConfig};
 use handful::plan::{IcemConfig, PlannerConfig};
 use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng;
 use handful::study::config::RunConfig;
 use handful::study::evaluate::{EvalSeeds, Evaluator};
-use handful::study::run::{Event, Run, is_complete, trained_agent};
+use handful::study::registry::Registry;
+use handful::study::run::{Event, Run, is_complete};
 
 /// An episode of learning; its return.
 fn episode(env: &mut World, agent: &mut dyn Agent, seed: u64) -> f32 {
     let (mut obs, mut total) = (env.reset(seed), 0.0);
+    agent.begin_episode();
     loop {
         let action = agent.act(&obs, Mode::Explore);
         let Step { observation, reward, terminated, truncated, .. } = env.step(&action).expect("a valid action");
@@ -53,24 +59,23 @@ fn sac_swings_the_pendulum_up() {
 /// After one random episode the model is good enough to plan in: the next return comes close to the oracle's.
 #[test]
 fn pets_swings_the_pendulum_up_after_one_random_episode() {
-    let [pets, oracle] = ["pets", "oracle"].map(|method| {
-        RunConfig::new(Task::Pendulum, method, 1, None, None).expect("a preset").agent().expect("an agent")
-    });
-    let (mut pets, mut oracle) = (pets, oracle);
     let mut env = Task::Pendulum.make();
+    let config = PetsConfig::preset_for("pets", "pendulum").expect("a preset");
+    let mut pets = Pets::new(env.spec(), Some(Arc::new(Task::Pendulum.make())), config, 1).expect("usable settings");
+    let config = OracleConfig::preset_for("oracle", "pendulum").expect("a preset");
+    let mut oracle = Oracle::new(|| Ok(Task::Pendulum.make()), config, 1).expect("usable settings");
     const START: u64 = (1 << 20) + 1;
-    let random = episode(&mut env, pets.as_mut(), START - 1);
-    let planned = episode(&mut env, pets.as_mut(), START);
+    let random = episode(&mut env, &mut pets, START - 1);
+    let planned = episode(&mut env, &mut pets, START);
 
-    let (mut obs, mut best, mut first) = (env.reset(START), 0.0, true);
+    let mut best = 0.0;
+    env.reset(START);
     loop {
-        let action = oracle.act_all(&[Slot { index: 0, first, obs: &obs, world: &env }]).remove(0);
-        let outcome = env.step(&action).expect("a valid action");
+        let outcome = env.step(&oracle.plan(0, &env.snapshot())).expect("a valid action");
         best += outcome.reward;
         if outcome.done() {
             break;
         }
-        (obs, first) = (outcome.observation, false);
     }
     assert!(random < best - 500.0, "random actions do not swing it up: {random}, oracle {best}");
     assert!(planned > best - 15.0, "planning in the model does: {planned}, oracle {best}");
@@ -80,29 +85,29 @@ fn pets_swings_the_pendulum_up_after_one_random_episode() {
 /// networks and three more thousand steps, -145.)
 #[test]
 fn dreamer_swings_the_pendulum_up() {
-    let mut config = RunConfig::new(Task::Pendulum, "dreamer", 0, None, None).expect("a preset");
-    let dreamer = config.dreamer.as_mut().expect("Dreamer's settings");
-    (dreamer.world.units, dreamer.behaviour.units) = (64, 64);
-    (dreamer.world.rssm.deter, dreamer.world.rssm.hidden, dreamer.world.rssm.stoch) = (64, 32, 8);
-    let (mut env, mut agent) = (Task::Pendulum.make(), config.agent().expect("an agent"));
+    let mut config = DreamerConfig::preset_for("dreamer", "pendulum").expect("a preset");
+    (config.world.units, config.behaviour.units) = (64, 64);
+    (config.world.rssm.deter, config.world.rssm.hidden, config.world.rssm.stoch) = (64, 32, 8);
+    let mut env = Task::Pendulum.make();
+    let mut agent = Dreamer::new(env.spec(), config, 0).expect("usable settings");
     for seed in 0..25 {
-        episode(&mut env, agent.as_mut(), seed);
+        episode(&mut env, &mut agent, seed);
     }
-    let mut evaluator = Evaluator::new(|| config.world()).expect("a world");
-    let evaluation = evaluator.evaluate(agent.as_mut(), 20, EvalSeeds::Test).expect("valid actions");
+    let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
+    let evaluation = evaluator.evaluate(&mut agent, 20, EvalSeeds::Test).expect("valid actions");
     let mean = evaluation.summary().return_mean;
     assert!(mean > -400.0, "mean return {mean}");
-    let five_steps = &agent.judge_model(&evaluation.episodes)[2];
-    assert!(five_steps.rmse < 0.3, "{five_steps:?}: 1 is as good as foreseeing no change");
+    let five_steps = &agent.open_loop(&evaluation.episodes)[2];
+    assert!(five_steps.rmse < 0.3, "{five_steps:?}: 1 is as good as predicting no change");
 }
 
 /// The planner before any model is learned: on the true simulator it must be good.
 #[test]
 fn the_oracle_swings_the_pendulum_up() {
-    let config = RunConfig::new(Task::Pendulum, "oracle", 0, None, None).expect("a preset");
-    let mut evaluator = Evaluator::new(|| config.world()).expect("a world");
-    let mut oracle = config.agent().expect("an oracle");
-    let summary = evaluator.evaluate(oracle.as_mut(), 6, EvalSeeds::Test).expect("valid actions").summary();
+    let config = OracleConfig::preset_for("oracle", "pendulum").expect("a preset");
+    let mut oracle = Oracle::new(|| Ok(Task::Pendulum.make()), config, 0).expect("usable settings");
+    let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
+    let summary = evaluator.evaluate(&mut oracle, 6, EvalSeeds::Test).expect("valid actions").summary();
     assert!(summary.return_mean > -200.0, "mean return {}", summary.return_mean);
     assert_eq!(summary.success, 1.0, "upright at the end, always");
 }
@@ -114,15 +119,56 @@ fn the_oracle_does_not_disturb_the_world() {
     let obs = world.reset(0);
     let mut untouched = Task::Reach.make();
     untouched.reset(0);
-    let config = RunConfig::new(Task::Reach, "oracle", 0, None, None).expect("a preset");
-    let mut oracle = config.agent().expect("an oracle");
-    let mut first = true;
-    for _ in 0..3 {
-        let slot = Slot { index: 0, first, obs: &obs, world: &world };
-        let action = oracle.act_all(&[slot]).remove(0);
+    let config = OracleConfig::preset_for("oracle", "reach").expect("a preset");
+    let mut oracle = Oracle::new(|| Ok(Task::Reach.make()), config, 0).expect("usable settings");
+    for step in 0..3 {
+        let slot = Slot::single(step == 0, &obs, &world);
+        let action = oracle.actions(&[slot]).expect("the oracle's own kind of world").remove(0);
         let (a, b) = (world.step(&action).expect("valid"), untouched.step(&action).expect("valid"));
         assert_eq!(a.observation, b.observation);
-        first = false;
+    }
+}
+
+#[test]
+fn an_oracle_refuses_another_kind_of_environment() {
+    let mut oracle = Oracle::new(|| Ok(Task::Reach.make()), OracleConfig::default(), 0).expect("usable settings");
+    let mut pendulum = handful::env::pendulum::Pendulum::default();
+    let obs = pendulum.reset(0);
+    let problem = oracle.actions(&[Slot::single(true, &obs, &pendulum)]).expect_err("a pendulum is no table");
+    assert!(problem.to_string().contains("`reach`") && problem.to_string().contains("`pendulum`"), "{problem}");
+}
+
+/// What `act` does in evaluation is what the evaluator measures: a loop of `begin_episode` and `act` brings the same
+/// return as the evaluator's batch, to the last bit, also for agents with a memory; and training is not disturbed.
+#[test]
+fn acting_alone_is_acting_in_an_evaluation() {
+    let registry = Registry::standard();
+    for config in [debug_run(7), small_pets(7), small_dreamer(7)] {
+        let mut method = registry.method(&config).expect("a method");
+        let agent = method.as_learner().expect("it learns");
+        let mut env = Task::Reach.make();
+        for seed in 0..4 {
+            episode(&mut env, agent, seed);
+        }
+        let training_state = |agent: &dyn handful::agent::Learner| format!("{:?}", agent.training_state());
+        let before = training_state(agent);
+        for start in [EvalSeeds::Test, EvalSeeds::Seed(5)] {
+            let mut evaluator = Evaluator::new(|| Ok(Task::Reach.make())).expect("a world");
+            let batch = evaluator.evaluate(agent, 1, start).expect("valid actions");
+            let mut obs = env.reset(start.seed(0));
+            agent.begin_episode();
+            let mut rewards = Vec::new();
+            loop {
+                let step = env.step(&agent.act(&obs, Mode::Evaluate)).expect("a valid action");
+                rewards.push(step.reward);
+                if step.done() {
+                    break;
+                }
+                obs = step.observation;
+            }
+            assert_eq!(rewards, batch.episodes[0].rewards, "{}", config.method);
+        }
+        assert_eq!(training_state(agent), before, "{}", config.method);
     }
 }
 
@@ -175,14 +221,14 @@ fn pieces_of_episodes_keep_what_belongs_together() {
 
 /// SAC shrunk to seconds.
 fn debug_run(seed: u64) -> RunConfig {
-    RunConfig::new(Task::Reach, "debug", seed, None, None).expect("a preset")
+    Registry::standard().config("reach", "debug", seed, None, None).expect("a preset")
 }
 
 /// PETS shrunk to seconds.
 fn small_pets(seed: u64) -> RunConfig {
-    let mut config = RunConfig::new(Task::Reach, "pets", seed, Some(600), None).expect("a preset");
+    let mut config = Registry::standard().config("reach", "pets", seed, Some(600), None).expect("a preset");
     (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
-    let pets = config.pets.as_mut().expect("PETS's settings");
+    let mut pets: PetsConfig = config.settings().expect("PETS's settings");
     pets.warm_up = 200;
     pets.ensemble =
         EnsembleConfig { hidden: vec![16], first_steps: 50, steps: 20, check_every: 10, ..pets.ensemble.clone() };
@@ -193,22 +239,26 @@ fn small_pets(seed: u64) -> RunConfig {
         iterations: 2,
         ..IcemConfig::default()
     });
-    config
+    config.with_settings(&pets)
 }
 
 /// Dreamer shrunk to seconds.
 fn small_dreamer(seed: u64) -> RunConfig {
-    let mut config = RunConfig::new(Task::Reach, "dreamer", seed, Some(600), None).expect("a preset");
+    let mut config = Registry::standard().config("reach", "dreamer", seed, Some(600), None).expect("a preset");
     (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
-    let dreamer = config.dreamer.as_mut().expect("Dreamer's settings");
+    let mut dreamer: DreamerConfig = config.settings().expect("Dreamer's settings");
     (dreamer.batch, dreamer.length, dreamer.train_ratio, dreamer.warm_up) = (2, 8, 1.0, 200);
     dreamer.world = WorldModelConfig { units: 16, layers: 1, ..dreamer.world.clone() };
     dreamer.world.rssm = RssmConfig { deter: 16, blocks: 2, hidden: 8, stoch: 4, classes: 4, ..RssmConfig::default() };
     dreamer.behaviour = ActorCriticConfig { units: 16, layers: 1, horizon: 5, ..ActorCriticConfig::default() };
-    config
+    config.with_settings(&dreamer)
 }
 
-fn finish(run: &mut Run) {
+fn open(config: &RunConfig, folder: &Path) -> Result<Run<Box<dyn Env>>> {
+    Registry::standard().open_run(config, folder)
+}
+
+fn finish(run: &mut Run<Box<dyn Env>>) {
     while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
 }
 
@@ -239,18 +289,19 @@ fn so_does_one_that_dreams() {
     let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"];
     ends_as_if_it_had_never_stopped(&small_dreamer(1), &files);
     // And if it plans in its dreams.
-    let mut planning = small_dreamer(2);
+    let planning = small_dreamer(2);
+    let mut dreamer: DreamerConfig = planning.settings().expect("Dreamer's settings");
     let planner = IcemConfig { horizon: 4, population: 10, elites: 4, iterations: 2, ..IcemConfig::default() };
-    planning.dreamer.as_mut().expect("Dreamer's settings").planner = Some(PlannerConfig::Icem(planner));
-    ends_as_if_it_had_never_stopped(&planning, &files);
+    dreamer.planner = Some(PlannerConfig::Icem(planner));
+    ends_as_if_it_had_never_stopped(&planning.with_settings(&dreamer), &files);
 }
 
 fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {
     let folder = tempfile::tempdir().expect("a folder");
     let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
-    finish(&mut Run::open(config.clone(), &whole).expect("a new run"));
+    finish(&mut open(config, &whole).expect("a new run"));
     {
-        let mut run = Run::open(config.clone(), &halves).expect("a new run");
+        let mut run = open(config, &halves).expect("a new run");
         while run.steps_done() < 300 || !run.between_episodes() {
             run.step().expect("a healthy run");
         }
@@ -258,7 +309,7 @@ fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {
         // What happens after the save is lost, as in a crash.
         (0..150).for_each(|_| drop(run.step().expect("a healthy run")));
     }
-    let mut run = Run::open(config.clone(), &halves).expect("a run to go on with");
+    let mut run = open(config, &halves).expect("a run to go on with");
     assert_eq!(run.steps_done(), 300);
     finish(&mut run);
     for file in files {
@@ -273,19 +324,21 @@ fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {
 #[test]
 fn a_test_goes_on_where_it_stopped() {
     for method in ["random", "oracle"] {
-        let mut config = RunConfig::new(Task::Pendulum, method, 0, None, None).expect("a preset");
+        let mut config = Registry::standard().config("pendulum", method, 0, None, None).expect("a preset");
         config.test_episodes = 21;
-        if let Some(oracle) = &mut config.oracle {
+        if method == "oracle" {
+            let mut oracle: OracleConfig = config.settings().expect("the oracle's settings");
             let quick = IcemConfig { horizon: 2, population: 4, elites: 2, iterations: 1, ..IcemConfig::default() };
             oracle.planner = PlannerConfig::Icem(quick);
+            config = config.with_settings(&oracle);
         }
         let folder = tempfile::tempdir().expect("a folder");
         let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
-        finish(&mut Run::open(config.clone(), &whole).expect("a new run"));
-        let first = Run::open(config.clone(), &halves).expect("a new run").step().expect("a healthy run");
+        finish(&mut open(&config, &whole).expect("a new run"));
+        let first = open(&config, &halves).expect("a new run").step().expect("a healthy run");
         assert!(matches!(first, Event::Testing(20)), "{first:?}");
-        let last = Run::open(config, &halves).expect("a run to go on with").step().expect("a healthy run");
-        assert!(matches!(&last, Event::Tested(test) if test.episodes.len() == 21), "{last:?}");
+        let last = open(&config, &halves).expect("a run to go on with").step().expect("a healthy run");
+        assert!(matches!(&last, Event::Tested(test) if test.results.len() == 21), "{last:?}");
         let [whole, halves] = [whole, halves].map(|run| std::fs::read_to_string(run.join("test.csv")).expect("a test"));
         assert_eq!(whole, halves, "{method}");
     }
@@ -294,12 +347,12 @@ fn a_test_goes_on_where_it_stopped() {
 #[test]
 fn a_trained_agent_comes_back_from_its_folder() {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut run = Run::open(debug_run(2), folder.path()).expect("a new run");
+    let mut run = open(&debug_run(2), folder.path()).expect("a new run");
     finish(&mut run);
-    let (config, mut agent) = trained_agent(folder.path()).expect("a complete run");
+    let (config, mut method) = Registry::standard().trained_method(folder.path()).expect("a complete run");
     assert_eq!(config, debug_run(2));
-    let mut evaluator = Evaluator::new(|| config.world()).expect("a world");
-    let again = evaluator.evaluate(agent.as_mut(), config.test_episodes, EvalSeeds::Test).expect("valid actions");
+    let mut evaluator = Evaluator::new(|| Registry::standard().make_env(&config)).expect("a world");
+    let again = evaluator.evaluate(&mut method, config.test_episodes, EvalSeeds::Test).expect("valid actions");
     let tested = std::fs::read_to_string(folder.path().join("summary.toml")).expect("a summary");
     let tested: toml::Table = toml::from_str(&tested).expect("TOML");
     assert_eq!(tested["return_mean"].as_float(), Some(again.summary().return_mean));
@@ -308,13 +361,14 @@ fn a_trained_agent_comes_back_from_its_folder() {
 #[test]
 fn a_folder_with_another_run_is_left_alone() {
     let folder = tempfile::tempdir().expect("a folder");
-    drop(Run::open(debug_run(3), folder.path()).expect("a new run"));
+    drop(open(&debug_run(3), folder.path()).expect("a new run"));
     let before = std::fs::read(folder.path().join("config.toml")).expect("a config");
-    let Err(problem) = Run::open(debug_run(4), folder.path()) else { panic!("another seed is another run") };
+    let Err(problem) = open(&debug_run(4), folder.path()) else { panic!("another seed is another run") };
     assert!(problem.to_string().contains("`seed` is 3, not 4"), "{problem}");
-    let mut other = debug_run(3);
-    other.sac.as_mut().expect("SAC's settings").discount = 0.5;
-    let Err(problem) = Run::open(other, folder.path()) else { panic!("another discount is another run") };
+    let other = debug_run(3);
+    let sac = SacConfig { discount: 0.5, ..other.settings().expect("SAC's settings") };
+    let other = other.with_settings(&sac);
+    let Err(problem) = open(&other, folder.path()) else { panic!("another discount is another run") };
     assert!(problem.to_string().contains("`sac.discount` is "), "{problem}");
     assert_eq!(std::fs::read(folder.path().join("config.toml")).expect("a config"), before);
 }
@@ -322,11 +376,11 @@ fn a_folder_with_another_run_is_left_alone() {
 #[test]
 fn a_damaged_checkpoint_is_named_and_kept() {
     let folder = tempfile::tempdir().expect("a folder");
-    finish(&mut Run::open(debug_run(5), folder.path()).expect("a new run"));
+    finish(&mut open(&debug_run(5), folder.path()).expect("a new run"));
     let checkpoint = folder.path().join("checkpoint/state.safetensors");
     let whole = std::fs::read(&checkpoint).expect("a checkpoint");
     std::fs::write(&checkpoint, &whole[..whole.len() / 2]).expect("a writable folder");
-    let Err(problem) = Run::open(debug_run(5), folder.path()) else { panic!("half a checkpoint is none") };
+    let Err(problem) = open(&debug_run(5), folder.path()) else { panic!("half a checkpoint is none") };
     assert!(matches!(problem, Error::BadFile { .. }), "{problem}");
     assert!(problem.to_string().contains("state.safetensors"), "{problem}");
     assert_eq!(std::fs::read(&checkpoint).expect("still there").len(), whole.len() / 2);

@@ -17,19 +17,13 @@ use nalgebra::Vector3;
 const CHANCE: f64 = 0.02;
 
 fn spec() -> Spec {
-    Spec {
-        name: "test".into(),
-        observation: vec![
-            Feature::new("moved"),
-            Feature::new("turned"),
-            Feature::new("still"),
-            Feature::new("apart").difference("turned", "moved"),
-        ],
-        action_size: 1,
-        horizon: 50,
-        dt: 0.1,
-        stages: vec![],
-    }
+    let observation = [
+        Feature::new("moved"),
+        Feature::new("turned"),
+        Feature::new("still"),
+        Feature::new("apart").difference("turned", "moved"),
+    ];
+    Spec::new("test", observation, 1, 50, 0.1)
 }
 
 fn expected(obs: &[f32], action: f32) -> [f32; 3] {
@@ -255,7 +249,7 @@ fn latent_models_foresee_too() {
         wrong += (told - truth).abs() / episode.actions.len() as f32;
     }
     assert!(wrong < 0.15, "rewards between -3 and 0 are told to {wrong}");
-    assert!((world.continues(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
+    assert!((world.continuations(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
 }
 
 /// The tape's gradients against central differences, for known and for learned rewards.
@@ -313,7 +307,7 @@ fn gates_keep_still_what_nobody_touches() {
         Feature::new("block"),
         Feature::new("hand to block").around(0.0, 0.2).difference("block", "hand"),
     ];
-    let spec = Spec { observation: features, ..spec() };
+    let spec = Spec::new("test", features, 1, 50, 0.1);
     let seen = |hand: f32, block: f32| vec![hand, block, block - hand];
     let step = |obs: &[f32], action: f32| {
         let (hand, block) = (obs[0] + 0.1 * action, obs[1]);

@@ -52,7 +52,7 @@ fn the_hybrid_trusts_no_slope_that_does_not_keep_its_word() {
 #[test]
 fn a_receding_horizon_plans_only_when_it_is_time() {
     let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 50 });
-    let mut control = RecedingHorizon::new(&config, 2, &ControlConfig { action_repeat: 2, replan_every: 3 });
+    let mut control = RecedingHorizon::new(config.build(2), 2, &ControlConfig { action_repeat: 2, replan_every: 3 });
     let mut rng = rng::stream(0, "receding");
     let mut plans = 0;
     let target = target();

@@ -139,7 +139,7 @@ fn a_seed_fixes_an_episode() {
 fn many_worlds_at_once_are_the_same_worlds() {
     let seeds: Vec<u64> = (0..6).collect();
     let mut many = VectorEnv::new(6, || Task::Lift.make());
-    let mut observations = many.reset(&seeds);
+    let mut observations = many.reset(&seeds).expect("one seed for each");
     let mut alone: Vec<World> = seeds.iter().map(|_| Task::Lift.make()).collect();
     let first: Vec<Vec<f32>> = alone.iter_mut().zip(&seeds).map(|(env, seed)| env.reset(*seed)).collect();
     assert_eq!(observations, first);

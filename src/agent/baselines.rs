@@ -1,95 +1,79 @@
-//! Agents that do not learn: the floor, and what a person would write.
+//! Policies that do not learn: the lower bound, and what a person would write.
 
-use super::{Agent, Mode};
+use super::{Agent, Checkpoint, Mode};
 use crate::env::tabletop::{ObservationKind, TableOptions};
 use crate::env::{Spec, Task};
 use crate::error::{Error, Result};
+use crate::nn::Weights;
 use crate::rng::{self, Rng};
 
 /// Uniform random actions.
+#[derive(Debug)]
 pub struct Random {
-    actions: usize,
+    action_size: usize,
     rng: Rng,
 }
 
 impl Random {
     /// Random actions for an environment.
     pub fn new(spec: &Spec, seed: u64) -> Self {
-        Self { actions: spec.action_size, rng: rng::stream(seed, "random agent") }
+        Self { action_size: spec.action_size, rng: rng::stream(seed, "random agent") }
     }
 }
 
-/// From a compact observation to an action.
-type Policy = dyn Fn(&[f32]) -> Vec<f32> + Send;
-
-/// The hand-written policy of one of the arm's tasks.
+/// A hand-written policy.
 pub struct Scripted {
-    policy: Box<Policy>,
+    policy: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
 }
 
 impl Scripted {
-    /// The policy of `task`.
+    /// The policy that is a function from observations to actions, each number in [-1, 1].
+    pub fn new(policy: impl Fn(&[f32]) -> Vec<f32> + Send + 'static) -> Self {
+        Self { policy: Box::new(policy) }
+    }
+
+    /// The policy of one of this crate's tasks for the arm.
     ///
     /// # Errors
     /// If the task has none, or observations are not compact.
-    pub fn new(task: Task, options: TableOptions) -> Result<Self> {
+    pub fn of_task(task: Task, options: TableOptions) -> Result<Self> {
         if options.observation != ObservationKind::Compact {
-            return Err(Error::BadSetting("the scripted policies read compact observations".into()));
+            return Err(Error::BadSetting("the scripted policies need compact observations".into()));
         }
-        let policy = task
-            .scripted_policy(options)
-            .ok_or_else(|| Error::BadSetting(format!("{task} has no scripted policy; the arm's tasks do")))?;
-        Ok(Self { policy: Box::new(policy) })
+        let policy = task.scripted_policy(options);
+        policy.map(Self::new).ok_or_else(|| Error::BadSetting(format!("{task} has no scripted policy")))
     }
 }
 
-/// What there is to say of an agent that never learns. If it draws random numbers, from a field that is named here, it goes
-/// on with them after a stop.
-macro_rules! never_learns {
-    ($($rng:ident)?) => {
-        fn observe(&mut self, _transition: &crate::replay::Transition) {}
-
-        fn update(&mut self) -> Option<crate::agent::Losses> {
-            None
-        }
-
-        fn weights(&self) -> crate::nn::Weights {
-            crate::nn::Weights::default()
-        }
-
-        fn load_weights(&mut self, _weights: &crate::nn::Weights) -> crate::error::Result<()> {
-            Ok(())
-        }
-
-        #[allow(unused_mut)]
-        fn training_state(&self) -> crate::nn::Weights {
-            let mut state = crate::nn::Weights::default();
-            $(state.insert_counts("rng", &crate::rng::state(&self.$rng));)?
-            state
-        }
-
-        #[allow(unused_variables)]
-        fn load_training_state(&mut self, state: &crate::nn::Weights) -> crate::error::Result<()> {
-            $(self.$rng = crate::rng::from_state(&state.counts("rng", 4)?);)?
-            Ok(())
-        }
-    };
+impl std::fmt::Debug for Scripted {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.write_str("Scripted")
+    }
 }
-
-pub(super) use never_learns;
 
 impl Agent for Random {
     fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
-        (0..self.actions).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect()
+        (0..self.action_size).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect()
+    }
+}
+
+impl Checkpoint for Random {
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        state.insert_counts("rng", &rng::state(&self.rng));
+        state
     }
 
-    never_learns!(rng);
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        self.rng = rng::from_state(&state.counts("rng", 4)?);
+        Ok(())
+    }
 }
 
 impl Agent for Scripted {
     fn act(&mut self, obs: &[f32], _mode: Mode) -> Vec<f32> {
         (self.policy)(obs)
     }
-
-    never_learns!();
 }
+
+impl Checkpoint for Scripted {}

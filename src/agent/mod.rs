@@ -1,21 +1,49 @@
-//! Agents: wiring of models, planners and networks behind one small interface.
+//! Agents: the wiring of models, planners and networks behind one small interface.
+//!
+//! [`Agent`] is what a reader of the papers expects: act, observe, update. [`Checkpoint`] and [`Diagnostics`] are traits
+//! beside it, all of whose methods have defaults, so that an agent of one's own is a few lines:
+//!
+//! ```
+//! use handful::prelude::*;
+//!
+//! /// Pushes as hard as it can, always in the same direction.
+//! struct FullThrottle;
+//!
+//! impl Agent for FullThrottle {
+//!     fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
+//!         vec![1.0]
+//!     }
+//! }
+//!
+//! let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make()))?;
+//! let summary = evaluator.evaluate(&mut FullThrottle, 5, EvalSeeds::Test)?.summary();
+//! assert_eq!(summary.success, 0.0);
+//! # Ok::<(), handful::error::Error>(())
+//! ```
+//!
+//! [`Policy`] is what the evaluator needs: actions for several environments side by side. Every agent is a policy; the
+//! [`Oracle`] is a policy only, because it needs the environment itself.
 
 mod baselines;
 pub mod dreamer;
 mod oracle;
 mod pets;
+mod presets;
 mod sac;
+mod slots;
 mod warm_up;
 
 pub use baselines::{Random, Scripted};
 pub use dreamer::{Dreamer, DreamerConfig};
 pub use oracle::{Oracle, OracleConfig};
 pub use pets::{Pets, PetsConfig};
+pub(crate) use presets::{PRESETS, merge, preset_table, specialise};
+pub use presets::{Preset, method_names};
 pub use sac::{Sac, SacConfig};
+pub use slots::{Slot, Slots};
 
 use std::collections::BTreeMap;
 
-use crate::env::World;
 use crate::error::Result;
 use crate::model::open_loop::{Episode, OpenLoop};
 use crate::nn::Weights;
@@ -24,55 +52,45 @@ use crate::replay::Transition;
 /// Why an agent is asked to act.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// To learn: it may explore.
+    /// To collect experience: the agent may explore.
     Explore,
-    /// To be judged: it does its best, deterministically.
+    /// To be evaluated: the agent acts as well as it can, without exploration noise, and what it learns from is untouched.
     Evaluate,
 }
 
-/// Named numbers that an update reports: losses, entropies, norms.
+/// Named numbers that an update reports: losses, entropies, gradient norms.
 pub type Losses = BTreeMap<&'static str, f32>;
 
-/// A place from which an agent acts in an evaluation: one of several worlds side by side.
-#[derive(Clone, Copy)]
-pub struct Slot<'a> {
-    /// Its number; it stays the same through an episode.
-    pub index: usize,
-    /// Whether this is the first step of an episode.
-    pub first: bool,
-    /// What is observed.
-    pub obs: &'a [f32],
-    /// The world itself. Only an oracle looks at it.
-    pub world: &'a World,
-}
-
-/// A future that an agent imagined.
+/// An imagined trajectory: one rollout of a learned model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImaginedTrajectory {
-    /// What it expected to observe, from the present on.
+    /// Predicted observations, `[horizon + 1][observation]`; the first is the present one.
     pub observations: Vec<Vec<f32>>,
-    /// The return that it expected.
+    /// The predicted return.
     pub value: f32,
-    /// How far its models disagree about it.
+    /// How far the members of the ensemble disagree along the way.
     pub disagreement: f32,
 }
 
-/// What an agent expected of a moment, and what came of it.
+/// An estimate of the value at one time step of an episode, beside the return that followed.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Expectation {
-    /// The value that it gave the moment: the discounted rewards from there on.
+pub struct ValueEstimate {
+    /// The estimate: the discounted sum of rewards from this time step on.
     pub expected: f32,
-    /// The discounted rewards that came. What would come after an episode that the clock ended is taken from the value of
-    /// its last moment.
+    /// The discounted sum of the rewards that followed. After a truncation the return is bootstrapped from the estimate
+    /// at the last time step.
     pub realised: f32,
 }
 
-impl Expectation {
-    /// Of each moment of an episode but the last, from the values of all its moments.
+impl ValueEstimate {
+    /// One for each time step of an episode but the last, from the estimates at all of its time steps.
+    ///
+    /// # Panics
+    /// If there is no estimate.
     pub fn of_episode(values: &[f32], episode: &Episode, discount: f32) -> Vec<Self> {
-        let mut realised = if episode.terminated { 0.0 } else { *values.last().expect("a value for each moment") };
-        let moments = episode.rewards.iter().zip(values).rev();
-        let mut all: Vec<Self> = moments
+        let mut realised = if episode.terminated { 0.0 } else { *values.last().expect("a value for each time step") };
+        let steps = episode.rewards.iter().zip(values).rev();
+        let mut all: Vec<Self> = steps
             .map(|(reward, expected)| {
                 realised = reward + discount * realised;
                 Self { expected: *expected, realised }
@@ -83,55 +101,185 @@ impl Expectation {
     }
 }
 
-/// Something that acts and learns.
+/// An agent: it acts, observes what came of it, and updates itself.
+///
+/// One step of training is `act`, a step of the environment, `observe`, `update`; `begin_episode` comes after each
+/// reset of the environment.
 pub trait Agent: Send {
+    /// A new episode begins: clears what the agent remembers of the one before (a recurrent state, a plan).
+    fn begin_episode(&mut self) {}
+
     /// Chooses an action, each number in [-1, 1].
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32>;
 
-    /// Actions in many worlds at once, in [`Mode::Evaluate`]. Networks answer for all of them in one
-    /// pass; agents with a memory keep one for each slot.
-    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+    /// Takes in one transition of experience.
+    fn observe(&mut self, _transition: &Transition) {}
+
+    /// Learns from what was observed; called once after every step. `None` while it only collects.
+    fn update(&mut self) -> Option<Losses> {
+        None
+    }
+
+    /// Actions in several environments side by side, in [`Mode::Evaluate`]. The default asks [`Agent::act`] for each.
+    /// Override it to answer in one forward pass, and always if the agent has a memory: it needs one for each slot
+    /// ([`Slots`]).
+    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
         slots.iter().map(|slot| self.act(slot.obs, Mode::Evaluate)).collect()
     }
 
-    /// Acts from one slot as [`Agent::act_all`] does, and shows some of the futures that were weighed up for it: nothing
-    /// for agents that do not plan in a model.
-    fn act_and_show(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        (self.act_all(&[*slot]).remove(0), Vec::new())
+    /// The action that [`Agent::act_batch`] would choose in one slot, with some of the imagined trajectories behind it;
+    /// none for agents that do not imagine.
+    fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        (self.act_batch(&[*slot]).remove(0), Vec::new())
+    }
+}
+
+/// Chooses actions in evaluations. Every [`Agent`] is a policy; a policy that needs the environment itself, as the
+/// [`Oracle`] does, is a policy only.
+pub trait Policy: Send {
+    /// One action for each slot.
+    ///
+    /// # Errors
+    /// If the policy cannot act in such an environment.
+    fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>>;
+
+    /// The action for one slot, with some of the imagined trajectories behind it.
+    ///
+    /// # Errors
+    /// As [`Policy::actions`].
+    fn explained_action(&mut self, slot: &Slot) -> Result<(Vec<f32>, Vec<ImaginedTrajectory>)> {
+        Ok((self.actions(&[*slot])?.remove(0), Vec::new()))
+    }
+}
+
+impl<A: Agent + ?Sized> Policy for A {
+    fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
+        Ok(self.act_batch(slots))
     }
 
-    /// Takes in one step of experience.
-    fn observe(&mut self, transition: &Transition);
+    fn explained_action(&mut self, slot: &Slot) -> Result<(Vec<f32>, Vec<ImaginedTrajectory>)> {
+        Ok(self.act_and_explain(slot))
+    }
+}
 
-    /// Learns from what was observed; called once after every step. `None` while it only collects.
-    fn update(&mut self) -> Option<Losses>;
-
-    /// How well its model foresees episodes that it has not learned from; nothing for agents without a model.
-    fn judge_model(&self, _traces: &[Episode]) -> Vec<OpenLoop> {
-        Vec::new()
+/// What is saved of an agent. The defaults save nothing.
+pub trait Checkpoint {
+    /// What it has learned, enough to act.
+    fn weights(&self) -> Weights {
+        Weights::default()
     }
 
-    /// What it expects of each moment of episodes, beside what came; nothing for agents that expect nothing.
-    fn judge_values(&self, _traces: &[Episode]) -> Vec<Expectation> {
-        Vec::new()
-    }
-
-    /// What the agent has learned, enough to act.
-    fn weights(&self) -> Weights;
-
-    /// Takes over learned weights.
+    /// Takes over what [`Checkpoint::weights`] has given.
     ///
     /// # Errors
     /// If they are not those of an agent of this kind and these sizes.
-    fn load_weights(&mut self, weights: &Weights) -> Result<()>;
+    fn load_weights(&mut self, _weights: &Weights) -> Result<()> {
+        Ok(())
+    }
 
-    /// Everything else that training needs to go on as if it had never stopped: optimisers,
-    /// experience, random numbers.
-    fn training_state(&self) -> Weights;
+    /// Everything else that a resumed training needs: optimiser states, the replay buffer, random number generators.
+    fn training_state(&self) -> Weights {
+        Weights::default()
+    }
 
-    /// Takes over what [`Agent::training_state`] has given.
+    /// Takes over what [`Checkpoint::training_state`] has given.
     ///
     /// # Errors
     /// If it is not that of an agent of this kind and these sizes.
-    fn load_training_state(&mut self, state: &Weights) -> Result<()>;
+    fn load_training_state(&mut self, _state: &Weights) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// How good an agent's model and critic are, measured on recorded episodes that it has not learned from. The defaults
+/// have nothing to measure.
+pub trait Diagnostics {
+    /// The open-loop prediction error of its model, for several horizons.
+    fn open_loop(&self, _episodes: &[Episode]) -> Vec<OpenLoop> {
+        Vec::new()
+    }
+
+    /// Its value estimates, beside the returns that followed.
+    fn value_estimates(&self, _episodes: &[Episode]) -> Vec<ValueEstimate> {
+        Vec::new()
+    }
+}
+
+/// An agent that a run can train, save and diagnose.
+pub trait Learner: Agent + Checkpoint + Diagnostics {}
+
+impl<A: Agent + Checkpoint + Diagnostics> Learner for A {}
+
+/// A policy that does not learn, but may have a state to save.
+pub trait FixedPolicy: Policy + Checkpoint {}
+
+impl<P: Policy + Checkpoint> FixedPolicy for P {}
+
+/// What a run carries out and a study compares.
+pub enum Method {
+    /// An agent that learns.
+    Learner(Box<dyn Learner>),
+    /// A policy that does not: it is only tested.
+    Fixed(Box<dyn FixedPolicy>),
+}
+
+impl Method {
+    /// An agent that learns.
+    pub fn learner(agent: impl Learner + 'static) -> Self {
+        Self::Learner(Box::new(agent))
+    }
+
+    /// A policy that does not learn.
+    pub fn fixed(policy: impl FixedPolicy + 'static) -> Self {
+        Self::Fixed(Box::new(policy))
+    }
+
+    /// The agent, if it learns.
+    pub fn as_learner(&mut self) -> Option<&mut dyn Learner> {
+        match self {
+            Self::Learner(agent) => Some(agent.as_mut()),
+            Self::Fixed(_) => None,
+        }
+    }
+
+    /// What is saved of it.
+    pub fn checkpoint(&self) -> &dyn Checkpoint {
+        match self {
+            Self::Learner(agent) => agent.as_ref(),
+            Self::Fixed(policy) => policy.as_ref(),
+        }
+    }
+
+    /// The same, to be loaded into.
+    pub fn checkpoint_mut(&mut self) -> &mut dyn Checkpoint {
+        match self {
+            Self::Learner(agent) => agent.as_mut(),
+            Self::Fixed(policy) => policy.as_mut(),
+        }
+    }
+}
+
+impl std::fmt::Debug for Method {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Learner(_) => "Method::Learner",
+            Self::Fixed(_) => "Method::Fixed",
+        })
+    }
+}
+
+impl Policy for Method {
+    fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
+        match self {
+            Self::Learner(agent) => Ok(agent.act_batch(slots)),
+            Self::Fixed(policy) => policy.actions(slots),
+        }
+    }
+
+    fn explained_action(&mut self, slot: &Slot) -> Result<(Vec<f32>, Vec<ImaginedTrajectory>)> {
+        match self {
+            Self::Learner(agent) => Ok(agent.act_and_explain(slot)),
+            Self::Fixed(policy) => policy.explained_action(slot),
+        }
+    }
 }

@@ -1,20 +1,17 @@
 //! The oracle: a planner on the true simulator.
 //!
-//! It is not an agent that anyone could have (it tries things out in the very world in which it acts, and puts the
-//! world back), but the upper bound for all that plan in a world that they have learned: what remains between
-//! such an agent and the oracle is the model's fault, not the planner's.
-
-use std::collections::BTreeMap;
+//! It is no agent that anyone could have: it tries action sequences out in a copy of the very environment in which it
+//! acts. It is the upper bound for everything that plans in a learned model: what remains between such an agent and the
+//! oracle is the model's error, not the planner's.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::baselines::never_learns;
-use super::{Agent, Mode, Slot};
-use crate::env::tabletop::TableOptions;
-use crate::env::{Env, Snapshot, Task, World, WorldState};
-use crate::error::Result;
-use crate::plan::{ActionSequences, ControlConfig, IcemConfig, PlannerConfig, RecedingHorizon};
+use super::{Checkpoint, Policy, Slot, Slots};
+use crate::env::{Env, Snapshot};
+use crate::error::{Error, Result};
+use crate::nn::Weights;
+use crate::plan::{ActionSequences, ControlConfig, IcemConfig, MakePlanner, PlannerConfig, RecedingHorizon};
 use crate::rng::{self, Rng};
 
 /// Settings of [`Oracle`].
@@ -25,7 +22,7 @@ pub struct OracleConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
-    /// Steps that the last state of a plan is taken to last: its reward counts so many times more.
+    /// Weight of the terminal reward: the reward of a plan's last step counts 1 + `terminal_weight` times.
     pub terminal_weight: f32,
 }
 
@@ -39,52 +36,91 @@ impl Default for OracleConfig {
     }
 }
 
-/// A controller for each slot, and worlds to try things out in.
-pub struct Oracle {
+/// Receding-horizon control with the true environment as the model, in any environment that can be restored.
+///
+/// ```
+/// use handful::prelude::*;
+///
+/// let mut oracle = Oracle::new(|| Ok(Task::Pendulum.make()), OracleConfig::default(), 0)?;
+/// let mut env = Task::Pendulum.make();
+/// env.reset(0);
+/// let action = oracle.plan(0, &env.snapshot());
+/// assert_eq!(action.len(), 1);
+/// # Ok::<(), handful::error::Error>(())
+/// ```
+pub struct Oracle<E: Env + Snapshot> {
     config: OracleConfig,
-    actions: usize,
-    controllers: BTreeMap<usize, RecedingHorizon>,
-    /// One for each thread.
-    worlds: Vec<World>,
+    planner: Box<dyn MakePlanner>,
+    action_size: usize,
+    controllers: Slots<RecedingHorizon>,
+    /// Environments to try action sequences in, one for each thread.
+    simulators: Vec<E>,
     rng: Rng,
 }
 
-impl Oracle {
-    /// An oracle for a task.
+impl<E: Env + Snapshot> Oracle<E> {
+    /// An oracle for the environments that `make` makes.
     ///
     /// # Errors
-    /// If a setting cannot be used.
-    pub fn new(task: Task, options: TableOptions, config: OracleConfig, seed: u64) -> Result<Self> {
+    /// If a setting cannot be used, or what `make` answers.
+    pub fn new(make: impl Fn() -> Result<E>, config: OracleConfig, seed: u64) -> Result<Self> {
         config.control.check(&config.planner)?;
-        let worlds = (0..rayon::current_num_threads()).map(|_| task.make_with(options)).collect::<Result<Vec<_>>>()?;
-        let actions = worlds[0].spec().action_size;
-        Ok(Self { config, actions, controllers: BTreeMap::new(), worlds, rng: rng::stream(seed, "oracle") })
+        let simulators = (0..rayon::current_num_threads()).map(|_| make()).collect::<Result<Vec<_>>>()?;
+        simulators[0].spec().check()?;
+        Ok(Self {
+            action_size: simulators[0].spec().action_size,
+            planner: Box::new(config.planner.clone()),
+            config,
+            controllers: Slots::default(),
+            simulators,
+            rng: rng::stream(seed, "oracle"),
+        })
     }
 
-    fn plan(&mut self, slot: &Slot) -> Vec<f32> {
-        let Self { config, actions, controllers, worlds, rng } = self;
-        let new = || RecedingHorizon::new(&config.planner, *actions, &config.control);
-        let controller = controllers.entry(slot.index).or_insert_with(new);
-        if slot.first {
-            controller.reset();
-        }
-        let state = slot.world.snapshot();
-        let mut objective = |candidates: &ActionSequences| returns(worlds, &state, candidates, config.terminal_weight);
+    /// The same oracle with a planner of the caller's own instead of `config.planner`.
+    #[must_use]
+    pub fn with_planner(self, planner: impl MakePlanner + 'static) -> Self {
+        Self { planner: Box::new(planner), controllers: Slots::default(), ..self }
+    }
+
+    /// A new episode begins in the slot `index`: its plan is dropped.
+    pub fn begin_episode(&mut self, index: usize) {
+        self.controllers.clear(index);
+    }
+
+    /// The action to take in `state`, in the slot `index` (0 if there is one environment only).
+    pub fn plan(&mut self, index: usize, state: &E::State) -> Vec<f32> {
+        let Self { config, planner, action_size, controllers, simulators, rng } = self;
+        let new = |_| RecedingHorizon::new(planner.make(*action_size), *action_size, &config.control);
+        let controller = controllers.state(index, new);
+        let mut objective =
+            |candidates: &ActionSequences| returns(simulators, state, candidates, config.terminal_weight);
         controller.act(&mut objective, &mut |_| {}, rng)
     }
 }
 
-/// The return of each sequence, tried out from `state`, the work shared out over the worlds.
-fn returns(worlds: &mut [World], state: &WorldState, candidates: &ActionSequences, terminal_weight: f32) -> Vec<f32> {
-    let share = candidates.count().div_ceil(worlds.len());
+impl<E: Env + Snapshot> std::fmt::Debug for Oracle<E> {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.debug_struct("Oracle").field("config", &self.config).finish_non_exhaustive()
+    }
+}
+
+/// The return of each sequence from `state` on, the work shared out over the simulators.
+fn returns<E: Env + Snapshot>(
+    simulators: &mut [E],
+    state: &E::State,
+    candidates: &ActionSequences,
+    terminal_weight: f32,
+) -> Vec<f32> {
+    let share = candidates.count().div_ceil(simulators.len());
     let mut returns = vec![0.0; candidates.count()];
-    let shares = returns.par_chunks_mut(share).zip(worlds).enumerate();
-    shares.for_each(|(part, (returns, world))| {
+    let shares = returns.par_chunks_mut(share).zip(simulators).enumerate();
+    shares.for_each(|(part, (returns, env))| {
         for (i, total) in returns.iter_mut().enumerate() {
-            world.restore(state);
+            env.restore(state);
             let mut last = 0.0;
             for action in candidates.row(part * share + i).chunks(candidates.actions) {
-                let Ok(step) = world.step(action) else {
+                let Ok(step) = env.step(action) else {
                     *total = f32::NAN;
                     break;
                 };
@@ -101,16 +137,33 @@ fn returns(worlds: &mut [World], state: &WorldState, candidates: &ActionSequence
     returns
 }
 
-impl Agent for Oracle {
-    /// # Panics
-    /// Always: an oracle needs the world, which [`Agent::act_all`] shows it.
-    fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
-        panic!("an oracle acts from a seat in a world, not on an observation")
+impl<E: Env + Snapshot> Policy for Oracle<E> {
+    /// # Errors
+    /// If a slot's environment is not an `E`.
+    fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
+        let plan = |slot: &Slot| {
+            let env = slot.env.downcast_ref::<E>().ok_or_else(|| {
+                let wanted = &self.simulators[0].spec().name;
+                Error::BadSetting(format!("an oracle for `{wanted}` cannot plan in `{}`", slot.env.spec().name))
+            })?;
+            if slot.first {
+                self.begin_episode(slot.index);
+            }
+            Ok(self.plan(slot.index, &env.snapshot()))
+        };
+        slots.iter().map(plan).collect()
+    }
+}
+
+impl<E: Env + Snapshot> Checkpoint for Oracle<E> {
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        state.insert_counts("rng", &rng::state(&self.rng));
+        state
     }
 
-    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        slots.iter().map(|slot| self.plan(slot)).collect()
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        self.rng = rng::from_state(&state.counts("rng", 4)?);
+        Ok(())
     }
-
-    never_learns!(rng);
 }

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::warm_up::RandomActions;
-use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot};
+use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::{KnownReward, Spec};
 use crate::error::{Error, Result};
 use crate::model::open_loop::{Episode, OpenLoop, open_loop};
@@ -22,6 +22,9 @@ use crate::plan::{
 };
 use crate::replay::{ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
+
+/// A known reward, shared between threads.
+type DynReward = dyn KnownReward + Send + Sync;
 
 /// Of each iteration of a planner that is watched, so many sequences are shown.
 const SHOWN: usize = 8;
@@ -99,7 +102,8 @@ impl PetsConfig {
 pub struct Pets {
     config: PetsConfig,
     spec: Spec,
-    reward: Arc<dyn KnownReward + Send + Sync>,
+    /// None if the ensemble learns the reward.
+    reward: Option<Arc<DynReward>>,
     ensemble: Ensemble,
     /// The snapshot to plan in, once there is something to plan in.
     dynamics: Option<Dynamics>,
@@ -108,8 +112,8 @@ pub struct Pets {
     random: RandomActions,
     /// Plans where it learns.
     controller: Controller,
-    /// Plan where it is judged, one for each slot.
-    slots: Vec<Controller>,
+    /// Plan where it is evaluated.
+    slots: Slots<Controller>,
     rng: Rng,
 }
 
@@ -120,13 +124,20 @@ struct Controller {
 }
 
 impl Pets {
-    /// A fresh agent for an environment whose reward is `reward` (which is used only if the ensemble does not learn
-    /// rewards).
+    /// A new agent for an environment. It plans with the known `reward`, unless `config.ensemble.learn_reward` is set:
+    /// then it learns the reward from experience, and none needs to be known.
     ///
     /// # Errors
-    /// If a setting cannot be used.
-    pub fn new(spec: &Spec, reward: Arc<dyn KnownReward + Send + Sync>, config: PetsConfig, seed: u64) -> Result<Self> {
+    /// If a setting cannot be used, or the reward is neither known nor learned.
+    pub fn new(spec: &Spec, reward: Option<Arc<DynReward>>, config: PetsConfig, seed: u64) -> Result<Self> {
         config.check()?;
+        spec.check()?;
+        if reward.is_none() && !config.ensemble.learn_reward {
+            return Err(Error::BadSetting(format!(
+                "pets: the reward of `{}` is not known as a function of observations; set `ensemble.learn_reward = true`",
+                spec.name
+            )));
+        }
         let mut rng = rng::stream(seed, "pets");
         Ok(Self {
             ensemble: Ensemble::new(spec, config.ensemble.clone(), &mut rng)?,
@@ -135,7 +146,7 @@ impl Pets {
             observed: 0,
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
             controller: Controller::new(&config, spec, rng::stream(seed, "pets planner")),
-            slots: Vec::new(),
+            slots: Slots::default(),
             spec: spec.clone(),
             reward,
             rng,
@@ -146,21 +157,6 @@ impl Pets {
     /// The model that it plans in, once it has one.
     pub fn dynamics(&self) -> Option<&Dynamics> {
         self.dynamics.as_ref()
-    }
-
-    /// Makes sure that there is a controller for each slot, and a fresh one for an episode that begins: then the same
-    /// weights act alike in the same episode, whatever was judged before.
-    fn prepare(&mut self, slots: &[Slot]) {
-        let Self { slots: controllers, config, spec, .. } = self;
-        let fresh = |number: usize| Controller::new(config, spec, rng::stream(number as u64, "pets seat"));
-        for slot in slots {
-            while controllers.len() <= slot.index {
-                controllers.push(fresh(controllers.len()));
-            }
-            if slot.first {
-                controllers[slot.index] = fresh(slot.index);
-            }
-        }
     }
 
     /// Fits the model to all experience now, and plans in the new one from here on.
@@ -206,8 +202,16 @@ impl Objective for EnsembleObjective<'_> {
 }
 
 impl Controller {
+    /// The controller of a slot, which depends on nothing but the slot's index.
+    fn of_slot(config: &PetsConfig, spec: &Spec, index: usize) -> Self {
+        Self::new(config, spec, rng::stream(index as u64, "pets seat"))
+    }
+
     fn new(config: &PetsConfig, spec: &Spec, rng: Rng) -> Self {
-        Self { control: RecedingHorizon::new(&config.planner, spec.action_size, &config.control), rng }
+        Self {
+            control: RecedingHorizon::new(config.planner.build(spec.action_size), spec.action_size, &config.control),
+            rng,
+        }
     }
 
     fn act(
@@ -233,26 +237,28 @@ impl Controller {
 struct PlanningModel<'a> {
     config: &'a PetsConfig,
     dynamics: &'a Dynamics,
-    reward: &'a (dyn KnownReward + Send + Sync),
+    reward: Option<&'a DynReward>,
     /// What the last state of a plan is worth.
-    tail: Option<Box<Value<'a>>>,
+    terminal: Option<Box<Value<'a>>>,
 }
 
 impl<'a> PlanningModel<'a> {
-    fn new(config: &'a PetsConfig, dynamics: &'a Dynamics, reward: &'a (dyn KnownReward + Send + Sync)) -> Self {
+    fn new(config: &'a PetsConfig, dynamics: &'a Dynamics, reward: Option<&'a DynReward>) -> Self {
+        let reward = reward.filter(|_| !config.ensemble.learn_reward);
         let rest = vec![0.0; dynamics.action_size()];
-        let lasting = move |state: &[f32]| config.terminal_weight * reward.reward(state, &rest, state);
-        let tail = (config.terminal_weight > 0.0 && !config.ensemble.learn_reward).then(|| Box::new(lasting) as Box<_>);
-        Self { config, dynamics, reward, tail }
+        let terminal = reward.filter(|_| config.terminal_weight > 0.0).map(|reward| -> Box<Value<'a>> {
+            Box::new(move |state: &[f32]| config.terminal_weight * reward.reward(state, &rest, state))
+        });
+        Self { config, dynamics, reward, terminal }
     }
 
     fn imagination(&self) -> Imagination<'_> {
         Imagination {
             dynamics: self.dynamics,
-            reward: if self.config.ensemble.learn_reward { Reward::Learned } else { Reward::Known(self.reward) },
+            reward: self.reward.map_or(Reward::Learned, |reward| Reward::Known(reward)),
             propagation: self.config.propagation,
             particles: self.config.particles,
-            value: self.tail.as_deref(),
+            value: self.terminal.as_deref(),
         }
     }
 
@@ -283,41 +289,55 @@ impl<'a> PlanningModel<'a> {
 }
 
 impl Agent for Pets {
+    fn begin_episode(&mut self) {
+        self.controller.control.reset();
+        self.random.reset();
+        self.slots.clear(0);
+    }
+
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
-        let Some(dynamics) = &self.dynamics else { return self.random.next(&mut self.rng) };
-        let model = PlanningModel::new(&self.config, dynamics, self.reward.as_ref());
-        let disagreement_bonus = if mode == Mode::Explore { self.config.disagreement_bonus } else { 0.0 };
-        self.controller.act(&model, obs, disagreement_bonus, &mut |_| {})
+        let Self { config, spec, reward, dynamics, random, controller, slots, rng, .. } = self;
+        match (dynamics, mode) {
+            (None, Mode::Explore) => random.next(rng),
+            (None, Mode::Evaluate) => vec![0.0; spec.action_size],
+            (Some(dynamics), Mode::Explore) => {
+                let model = PlanningModel::new(config, dynamics, reward.as_deref());
+                controller.act(&model, obs, config.disagreement_bonus, &mut |_| {})
+            }
+            (Some(dynamics), Mode::Evaluate) => {
+                let model = PlanningModel::new(config, dynamics, reward.as_deref());
+                slots.state(0, |i| Controller::of_slot(config, spec, i)).act(&model, obs, 0.0, &mut |_| {})
+            }
+        }
     }
 
-    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        self.prepare(slots);
-        let Some(dynamics) = &self.dynamics else { return vec![vec![0.0; self.spec.action_size]; slots.len()] };
-        let model = PlanningModel::new(&self.config, dynamics, self.reward.as_ref());
-        let mut controllers: Vec<Option<&mut Controller>> = self.slots.iter_mut().map(Some).collect();
-        let busy: Vec<(&Slot, &mut Controller)> = slots
-            .iter()
-            .map(|slot| (slot, controllers[slot.index].take().expect("seats have different numbers")))
-            .collect();
-        busy.into_par_iter().map(|(slot, controller)| controller.act(&model, slot.obs, 0.0, &mut |_| {})).collect()
+    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        let Self { config, spec, reward, dynamics, slots: controllers, .. } = self;
+        let Some(dynamics) = dynamics else { return vec![vec![0.0; spec.action_size]; slots.len()] };
+        let model = PlanningModel::new(config, dynamics, reward.as_deref());
+        let controllers = controllers.states(slots, |i| Controller::of_slot(config, spec, i));
+        let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
+        let each = controllers.into_par_iter().zip(observations);
+        each.map(|(controller, obs)| controller.act(&model, obs, 0.0, &mut |_| {})).collect()
     }
 
-    fn act_and_show(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        self.prepare(&[*slot]);
-        let Some(dynamics) = &self.dynamics else { return (vec![0.0; self.spec.action_size], Vec::new()) };
-        let model = PlanningModel::new(&self.config, dynamics, self.reward.as_ref());
-        // The plan, and of each iteration a few that were tried, from the best to the worst.
+    fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        let Self { config, spec, reward, dynamics, slots: controllers, .. } = self;
+        let Some(dynamics) = dynamics else { return (vec![0.0; spec.action_size], Vec::new()) };
+        let model = PlanningModel::new(config, dynamics, reward.as_deref());
+        let controller = controllers.states(&[*slot], |i| Controller::of_slot(config, spec, i)).remove(0);
+        // A few of each iteration's candidates, from the best to the worst.
         let mut shown: Option<ActionSequences> = None;
         let mut observer = |iteration: &Iteration| {
-            let tried = iteration.candidates;
-            let mut order: Vec<usize> = (0..tried.count()).collect();
+            let candidates = iteration.candidates;
+            let mut order: Vec<usize> = (0..candidates.count()).collect();
             order.sort_by(|a, b| iteration.returns[*b].total_cmp(&iteration.returns[*a]));
-            let some = order.iter().step_by((tried.count() / SHOWN).max(1)).flat_map(|&i| tried.row(i));
-            let shown = shown.get_or_insert_with(|| ActionSequences::new(tried.horizon, tried.actions));
-            // The newest, and so the best, come first.
+            let some = order.iter().step_by((candidates.count() / SHOWN).max(1)).flat_map(|&i| candidates.row(i));
+            let shown = shown.get_or_insert_with(|| ActionSequences::new(candidates.horizon, candidates.actions));
+            // The last iteration, which has the best candidates, comes first.
             shown.values.splice(0..0, some.copied());
         };
-        let action = self.slots[slot.index].act(&model, slot.obs, 0.0, &mut observer);
+        let action = controller.act(&model, slot.obs, 0.0, &mut observer);
         (action, shown.map(|shown| model.imagine_trajectories(slot.obs, &shown)).unwrap_or_default())
     }
 
@@ -334,12 +354,16 @@ impl Agent for Pets {
         let since = self.observed.checked_sub(self.config.warm_up)?;
         since.is_multiple_of(self.config.fit_every).then(|| self.fit())
     }
+}
 
-    fn judge_model(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
-        let judge = |dynamics| open_loop(dynamics, episodes, &mut rng::stream(0, "open loop"));
-        self.dynamics.as_ref().map(judge).unwrap_or_default()
+impl Diagnostics for Pets {
+    fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
+        let measure = |dynamics| open_loop(dynamics, episodes, &mut rng::stream(0, "open loop"));
+        self.dynamics.as_ref().map(measure).unwrap_or_default()
     }
+}
 
+impl Checkpoint for Pets {
     fn weights(&self) -> Weights {
         self.ensemble.weights()
     }

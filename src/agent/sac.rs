@@ -12,7 +12,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use super::{Agent, Expectation, Losses, Mode, Slot};
+use super::{Agent, Checkpoint, Diagnostics, Losses, Mode, Slot, ValueEstimate};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::open_loop::Episode;
@@ -112,6 +112,7 @@ impl Sac {
     /// If a setting cannot be used.
     pub fn new(spec: &Spec, config: SacConfig, seed: u64) -> Result<Self> {
         config.check()?;
+        spec.check()?;
         let cpu = device();
         let mut rng = rng::stream(seed, "sac");
         let (observations, actions) = (spec.observation_size(), spec.action_size);
@@ -265,7 +266,7 @@ impl Agent for Sac {
         values(&action).to_vec()
     }
 
-    fn act_all(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
         self.modes(&observations.concat())
     }
@@ -282,19 +283,23 @@ impl Agent for Sac {
         // Inside the thread pool, or every parallel piece of an update would be handed over to it anew.
         rayon::scope(|_| (0..self.config.updates_per_step).map(|_| self.learn()).last())
     }
+}
 
-    fn judge_values(&self, episodes: &[Episode]) -> Vec<Expectation> {
+impl Diagnostics for Sac {
+    fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
         let of_episode = |episode: &Episode| {
             let observations = episode.observations.concat();
             let actions = self.modes(&observations).concat();
             let actions = tensor(&self.cpu, actions, (1, episode.observations.len(), self.actions));
             let q = self.critics.forward(ops::join(self.observations(&observations), actions), Grad::Input);
             let values = q.min::<(usize, usize), Axis<0>>().as_vec();
-            Expectation::of_episode(&values, episode, self.config.discount)
+            ValueEstimate::of_episode(&values, episode, self.config.discount)
         };
         episodes.iter().flat_map(of_episode).collect()
     }
+}
 
+impl Checkpoint for Sac {
     fn weights(&self) -> Weights {
         let mut weights = Weights::default();
         weights.insert_module("policy", &self.policy);

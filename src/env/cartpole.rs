@@ -6,7 +6,7 @@
 use nalgebra::{RealField, UnitQuaternion, Vector3};
 
 use super::arm::{Pose, Primitive};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::{Env, Feature, KnownReward, Snapshot, Spec, Step};
 use crate::error::Result;
 use crate::rng;
@@ -81,14 +81,7 @@ impl Default for CartPole {
         let observation = [("position", 1.0), ("velocity", 1.0), ("angle", 0.1), ("angular velocity", 1.0)]
             .map(|(name, scale)| Feature::new(name).around(0.0, scale));
         Self {
-            spec: Spec {
-                name: "cartpole".into(),
-                observation: observation.into(),
-                action_size: 1,
-                horizon: 200,
-                dt: DT,
-                stages: vec!["standing".into()],
-            },
+            spec: Spec::new("cartpole", observation, 1, 200, DT).stages(["standing"]),
             state: CartPoleState::new([0.0; 4]),
         }
     }
@@ -110,14 +103,9 @@ impl Env for CartPole {
         self.state.step(MAX_FORCE * f64::from(action[0]).clamp(-1.0, 1.0));
         let observation = self.state.observe();
         let terminated = self.terminated(&observation);
-        Ok(Step {
-            reward: f32::from(!terminated),
-            terminated,
-            truncated: !terminated && self.state.elapsed >= self.spec.horizon,
-            success: !terminated,
-            stage: usize::from(!terminated),
-            observation,
-        })
+        let truncated = !terminated && self.state.elapsed >= self.spec.horizon;
+        let step = Step::new(observation, f32::from(!terminated)).terminated(terminated).truncated(truncated);
+        Ok(step.success(!terminated).stage(usize::from(!terminated)))
     }
 
     fn scene(&self) -> Vec<Body> {
@@ -137,13 +125,15 @@ impl Env for CartPole {
         let cart = Pose::translation(at.x, at.y, at.z);
         vec![Pose::translation(0.0, 0.0, 0.38), cart, Pose::from_parts(at.into(), lean)]
     }
-}
 
-impl CartPole {
-    /// Where the pole's tip would be drawn, m.
-    pub(super) fn tip(obs: &[f32]) -> [f64; 3] {
+    fn camera(&self) -> Camera {
+        Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] }
+    }
+
+    /// The pole's tip.
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
         let (sin, cos) = f64::from(obs[2]).sin_cos();
-        [f64::from(obs[0]) + 2.0 * HALF_LENGTH * sin, 0.0, 0.5 + 2.0 * HALF_LENGTH * cos]
+        Some([f64::from(obs[0]) + 2.0 * HALF_LENGTH * sin, 0.0, 0.5 + 2.0 * HALF_LENGTH * cos])
     }
 }
 

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use nalgebra::{RealField, UnitQuaternion, Vector3};
 
 use super::arm::{Pose, Primitive};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::{Env, Feature, KnownReward, Snapshot, Spec, Step};
 use crate::error::Result;
 use crate::rng;
@@ -79,14 +79,8 @@ impl Default for Pendulum {
     fn default() -> Self {
         let speed = Feature::new("angular velocity").around(0.0, MAX_SPEED as f32);
         Self {
-            spec: Spec {
-                name: "pendulum".into(),
-                observation: vec![Feature::new("cos angle"), Feature::new("sin angle"), speed],
-                action_size: 1,
-                horizon: 200,
-                dt: DT,
-                stages: vec!["upright".into()],
-            },
+            spec: Spec::new("pendulum", [Feature::new("cos angle"), Feature::new("sin angle"), speed], 1, 200, DT)
+                .stages(["upright"]),
             state: PendulumState::new(PI, 0.0),
         }
     }
@@ -108,14 +102,9 @@ impl Env for Pendulum {
         self.spec.check_action(action)?;
         let reward = self.state.step(MAX_TORQUE * f64::from(action[0]));
         let success = self.state.upright();
-        Ok(Step {
-            observation: self.state.observe(),
-            reward: reward as f32,
-            terminated: false,
-            truncated: self.state.elapsed >= self.spec.horizon,
-            success,
-            stage: usize::from(success),
-        })
+        let truncated = self.state.elapsed >= self.spec.horizon;
+        let step = Step::new(self.state.observe(), reward as f32).truncated(truncated);
+        Ok(step.success(success).stage(usize::from(success)))
     }
 
     fn scene(&self) -> Vec<Body> {
@@ -129,12 +118,14 @@ impl Env for Pendulum {
         let rod = Pose::from_parts(Vector3::new(0.0, 0.0, 1.2).into(), turn);
         vec![rod, rod * Pose::translation(0.0, 0.0, 1.0)]
     }
-}
 
-impl Pendulum {
-    /// Where the tip would be drawn, m.
-    pub(super) fn tip(obs: &[f32]) -> [f64; 3] {
-        [0.0, -f64::from(obs[1]), 1.2 + f64::from(obs[0])]
+    fn camera(&self) -> Camera {
+        Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] }
+    }
+
+    /// The tip.
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        Some([0.0, -f64::from(obs[1]), 1.2 + f64::from(obs[0])])
     }
 }
 

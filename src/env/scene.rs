@@ -1,6 +1,24 @@
-//! What a world looks like: bodies made of primitives, for the 3D replay.
+//! What an environment looks like: bodies made of primitives and a camera, for the 3D replay.
+
+use serde::Serialize;
 
 use super::arm::{Primitive, PrimitiveKind};
+
+/// Where the 3D replay is seen from, m; z points up.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Camera {
+    /// Position of the camera.
+    pub eye: [f64; 3],
+    /// The point that it looks at.
+    pub target: [f64; 3],
+}
+
+impl Default for Camera {
+    /// Looks at the origin from about four metres.
+    fn default() -> Self {
+        Self { eye: [2.4, -2.8, 1.6], target: [0.0; 3] }
+    }
+}
 
 /// A body to draw; where it stands comes from [`super::Env::poses`].
 #[derive(Clone, Debug)]

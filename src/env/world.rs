@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::arm::Pose;
 use super::cartpole::{CartPole, CartPoleState};
 use super::pendulum::{Pendulum, PendulumState};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::tabletop::{ActionKind, Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
 use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::{Error, Result};
@@ -116,18 +116,6 @@ pub enum World {
     CartPole(CartPole),
 }
 
-impl World {
-    /// Where the point that the task is about would be drawn (m) in a state that is observed so: the hand, the tip of
-    /// the pendulum or of the pole. None if the observation does not tell.
-    pub fn place_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
-        match self {
-            World::Tabletop(world) => world.hand_of(obs),
-            World::Pendulum(_) => Some(Pendulum::tip(obs)),
-            World::CartPole(_) => Some(CartPole::tip(obs)),
-        }
-    }
-}
-
 /// A state of any of the worlds.
 #[derive(Clone)]
 pub enum WorldState {
@@ -173,6 +161,14 @@ impl Env for World {
 
     fn poses(&self) -> Vec<Pose> {
         delegate!(self, world => world.poses())
+    }
+
+    fn camera(&self) -> Camera {
+        delegate!(self, world => world.camera())
+    }
+
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        delegate!(self, world => world.position_of(obs))
     }
 }
 

@@ -50,8 +50,8 @@ pub struct RecedingHorizon {
 
 impl RecedingHorizon {
     /// A controller for actions of so many numbers.
-    pub fn new(planner: &PlannerConfig, actions: usize, config: &ControlConfig) -> Self {
-        Self { config: config.clone(), planner: planner.build(actions), actions, ahead: VecDeque::new() }
+    pub fn new(planner: Box<dyn Planner>, actions: usize, config: &ControlConfig) -> Self {
+        Self { config: config.clone(), planner, actions, ahead: VecDeque::new() }
     }
 
     /// Forgets everything: a new episode.

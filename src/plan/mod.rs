@@ -134,6 +134,18 @@ pub trait Planner: Send {
     fn shift(&mut self, steps: usize);
 }
 
+/// Makes planners: a [`PlannerConfig`], or a closure from the numbers of an action to a planner.
+pub trait MakePlanner: Send + Sync {
+    /// A planner for actions of `action_size` numbers.
+    fn make(&self, action_size: usize) -> Box<dyn Planner>;
+}
+
+impl MakePlanner for PlannerConfig {
+    fn make(&self, action_size: usize) -> Box<dyn Planner> {
+        self.build(action_size)
+    }
+}
+
 /// A planner with its settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

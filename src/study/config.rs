@@ -1,68 +1,25 @@
-//! What a run is: task, method, seed, budget, settings; from presets, files and the command line.
+//! What a run is: task, method, seed, budget, settings.
 
 use std::path::Path;
-use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use toml::{Table, Value};
 
-use crate::agent::{
-    Agent, Dreamer, DreamerConfig, Oracle, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, Scripted,
-};
-use crate::env::tabletop::TableOptions;
-use crate::env::{Env, Task, World};
 use crate::error::{Error, Result};
 
-/// The presets that come with the crate: the methods that the command line knows. A preset's table
-/// `for.TASK` holds what differs for that task; `base` names a preset that it differs from.
-const PRESETS: [(&str, &str); 9] = [
-    ("random", include_str!("../../data/presets/random.toml")),
-    ("scripted", include_str!("../../data/presets/scripted.toml")),
-    ("oracle", include_str!("../../data/presets/oracle.toml")),
-    ("pets", include_str!("../../data/presets/pets.toml")),
-    ("dreamer", include_str!("../../data/presets/dreamer.toml")),
-    ("planet", include_str!("../../data/presets/planet.toml")),
-    ("size1m", include_str!("../../data/presets/size1m.toml")),
-    ("sac", include_str!("../../data/presets/sac.toml")),
-    ("debug", include_str!("../../data/presets/debug.toml")),
-];
-
-/// Names of all methods.
-pub fn methods() -> impl Iterator<Item = &'static str> {
-    PRESETS.iter().map(|(name, _)| *name)
-}
-
-/// The kinds of agent that a method can be made of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum AgentKind {
-    /// [`Random`].
-    Random,
-    /// [`Scripted`].
-    Scripted,
-    /// [`Oracle`].
-    Oracle,
-    /// [`Pets`].
-    Pets,
-    /// [`Dreamer`].
-    Dreamer,
-    /// [`Sac`].
-    Sac,
-}
-
-/// Everything that a run's outcome depends on.
+/// Everything that a run's outcome depends on. In TOML the agent's settings stand in the table that is named like it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// The task.
-    pub task: Task,
+    /// The task: the name of a registered environment.
+    pub task: String,
     /// The method's name: that of its preset.
     pub method: String,
     /// The seed of everything random in the run.
     pub seed: u64,
-    /// The kind of agent.
-    pub agent: AgentKind,
-    /// Environment steps to train for, random warm-up included.
+    /// The kind of agent: the name of a registered one.
+    pub agent: String,
+    /// Environment steps to train for, random warm-up included; 0 for a policy that does not learn.
     pub steps: usize,
     /// Environment steps between evaluations.
     #[serde(default = "default_evaluate_every")]
@@ -75,19 +32,10 @@ pub struct RunConfig {
     pub test_episodes: usize,
     /// Options of the environment.
     #[serde(default)]
-    pub env: TableOptions,
-    /// Settings of the oracle, for agents of that kind.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub oracle: Option<OracleConfig>,
-    /// Settings of PETS, for agents of that kind.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pets: Option<PetsConfig>,
-    /// Settings of Dreamer, for agents of that kind.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub dreamer: Option<DreamerConfig>,
-    /// Settings of SAC, for agents of that kind.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub sac: Option<SacConfig>,
+    pub env: Table,
+    /// Settings of the agent.
+    #[serde(skip)]
+    pub settings: Table,
 }
 
 fn default_evaluate_every() -> usize {
@@ -103,43 +51,51 @@ fn default_test_episodes() -> usize {
 }
 
 impl RunConfig {
-    /// A method's preset for a task, changed by a file of the same form if one is given, and by
-    /// `steps` if it is given.
-    ///
-    /// # Errors
-    /// If the method is unknown, the file cannot be read, or a field or value in it is wrong.
-    pub fn new(task: Task, method: &str, seed: u64, steps: Option<usize>, file: Option<&Path>) -> Result<Self> {
-        let mut table = preset(task, method)?;
-        if let Some(path) = file {
-            let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
-            let mut changes: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
-            specialise(&mut changes, task);
-            merge(&mut table, changes);
-        }
-        table.insert("task".into(), Value::String(task.name().into()));
-        table.insert("method".into(), Value::String(method.into()));
-        table.insert("seed".into(), Value::Integer(seed as i64));
-        if let Some(steps) = steps {
-            table.insert("steps".into(), Value::Integer(steps as i64));
-        }
-        let path = file.unwrap_or(Path::new(method));
-        let config: Self = table.try_into().map_err(|problem| bad_config(path, &problem))?;
-        config.check()?;
-        Ok(config)
-    }
-
     /// Reads the `config.toml` of a run.
     ///
     /// # Errors
     /// If there is none, or it is not one of ours.
     pub fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
-        let config: Self = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+        let mut table: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+        upgrade_keys(&mut table);
+        let config = Self::from_table(table).map_err(|problem| bad_config(path, &problem))?;
         config.check()?;
         Ok(config)
     }
 
-    fn check(&self) -> Result<()> {
+    /// From the table that [`RunConfig::to_table`] makes.
+    pub(crate) fn from_table(mut table: Table) -> Result<Self, toml::de::Error> {
+        let agent = table.get("agent").and_then(Value::as_str).unwrap_or_default().to_string();
+        let settings = match table.remove(&agent) {
+            Some(settings) => settings.try_into()?,
+            None => Table::new(),
+        };
+        Ok(Self { settings, ..table.try_into()? })
+    }
+
+    /// All of it as one table.
+    pub(crate) fn to_table(&self) -> Table {
+        let mut table = Table::try_from(self).expect("a configuration is TOML");
+        if !self.settings.is_empty() {
+            table.insert(self.agent.clone(), Value::Table(self.settings.clone()));
+        }
+        table
+    }
+
+    /// The text of `config.toml`.
+    pub(crate) fn to_toml(&self) -> String {
+        let mut text = toml::to_string(self).expect("a configuration is TOML");
+        if !self.settings.is_empty() {
+            let settings = Table::from_iter([(self.agent.clone(), Value::Table(self.settings.clone()))]);
+            text = text + "\n" + &toml::to_string(&settings).expect("settings are TOML");
+        }
+        text
+    }
+
+    /// # Errors
+    /// If a number that must be positive is not.
+    pub(crate) fn check(&self) -> Result<()> {
         for (name, value) in [
             ("evaluate_every", self.evaluate_every),
             ("evaluation_episodes", self.evaluation_episodes),
@@ -149,7 +105,7 @@ impl RunConfig {
                 return Err(Error::BadSetting(format!("`{name}` must be at least 1")));
             }
         }
-        if self.env.horizon == Some(0) {
+        if self.env.get("horizon").and_then(Value::as_integer) == Some(0) {
             return Err(Error::BadSetting("`env.horizon` must be at least 1".into()));
         }
         Ok(())
@@ -157,76 +113,77 @@ impl RunConfig {
 
     /// Whether the method learns; the others are only tested.
     pub fn learns(&self) -> bool {
-        self.steps > 0 && matches!(self.agent, AgentKind::Pets | AgentKind::Dreamer | AgentKind::Sac)
+        self.steps > 0
     }
 
-    /// The run's world.
+    /// The agent's settings.
     ///
     /// # Errors
-    /// If the options do not suit the task.
-    pub fn world(&self) -> Result<World> {
-        self.task.make_with(self.env)
+    /// If the agent's settings are of another type.
+    pub fn settings<C: DeserializeOwned>(&self) -> Result<C> {
+        let settings = self.settings.clone().try_into();
+        settings.map_err(|problem: toml::de::Error| Error::BadSetting(problem.message().into()))
     }
 
-    /// The run's agent, before it has learned anything.
+    /// The same run with other settings of the agent.
     ///
-    /// # Errors
-    /// If a setting cannot be used, or the task has no policy of the kind.
-    pub fn agent(&self) -> Result<Box<dyn Agent>> {
-        let world = self.world()?;
-        Ok(match self.agent {
-            AgentKind::Random => Box::new(Random::new(world.spec(), self.seed)),
-            AgentKind::Scripted => Box::new(Scripted::new(self.task, self.env)?),
-            AgentKind::Oracle => {
-                Box::new(Oracle::new(self.task, self.env, self.oracle.clone().unwrap_or_default(), self.seed)?)
-            }
-            AgentKind::Pets => {
-                let spec = world.spec().clone();
-                Box::new(Pets::new(&spec, Arc::new(world), self.pets.clone().unwrap_or_default(), self.seed)?)
-            }
-            AgentKind::Dreamer => {
-                Box::new(Dreamer::new(world.spec(), self.dreamer.clone().unwrap_or_default(), self.seed)?)
-            }
-            AgentKind::Sac => Box::new(Sac::new(world.spec(), self.sac.clone().unwrap_or_default(), self.seed)?),
-        })
+    /// # Panics
+    /// If the settings cannot be written as TOML.
+    #[must_use]
+    pub fn with_settings<C: Serialize>(self, settings: &C) -> Self {
+        Self { settings: Table::try_from(settings).expect("settings are TOML"), ..self }
     }
 }
 
-/// The settings of a method for a task: its preset's, over those of the preset that it names as its `base`.
-fn preset(task: Task, method: &str) -> Result<Table> {
-    let found = PRESETS.iter().find(|(name, _)| *name == method);
-    let (_, text) = found.ok_or_else(|| Error::unknown("method", method, methods()))?;
-    let mut table: Table = toml::from_str(text).expect("our presets are TOML");
-    specialise(&mut table, task);
-    let Some(Value::String(base)) = table.remove("base") else { return Ok(table) };
-    let mut whole = preset(task, &base)?;
-    merge(&mut whole, table);
-    Ok(whole)
+/// Keys that had another name in earlier versions, with the table in which they stand.
+const RENAMED_KEYS: [(&str, &str, &str); 13] = [
+    ("pets", "tail", "terminal_weight"),
+    ("oracle", "tail", "terminal_weight"),
+    ("pets", "caution", "disagreement_penalty"),
+    ("pets", "curiosity", "disagreement_bonus"),
+    ("pets", "warm_up_colour", "warm_up_noise_beta"),
+    ("dreamer", "warm_up_colour", "warm_up_noise_beta"),
+    ("dreamer", "exploration_colour", "exploration_noise_beta"),
+    ("ensemble", "anneal", "final_learning_rate_fraction"),
+    ("control", "hold", "action_repeat"),
+    ("icem", "colour", "noise_beta"),
+    ("gradient", "colour", "noise_beta"),
+    ("rssm", "memory", "deter"),
+    ("rssm", "categoricals", "stoch"),
+];
+
+/// Gives the keys and values of earlier versions the names that they have now.
+pub(crate) fn upgrade_keys(table: &mut Table) {
+    upgrade_table("", table);
 }
 
-/// Puts the part of a table that is for this task over the rest of it.
-fn specialise(table: &mut Table, task: Task) {
-    if let Some(Value::Table(mut by_task)) = table.remove("for")
-        && let Some(Value::Table(part)) = by_task.remove(task.name())
+fn upgrade_table(name: &str, table: &mut Table) {
+    for (_, old, new) in RENAMED_KEYS.iter().filter(|(within, ..)| *within == name) {
+        if let Some(value) = table.remove(*old) {
+            table.insert((*new).into(), value);
+        }
+    }
+    if let Some(Value::String(propagation)) = table.get_mut("propagation") {
+        match propagation.as_str() {
+            "members" => *propagation = "ts-inf-mean".into(),
+            "mean" => *propagation = "expectation".into(),
+            _ => {}
+        }
+    }
+    if let Some(Value::Table(risk)) = table.get_mut("risk")
+        && let Some(share) = risk.remove("worst")
     {
-        merge(table, part);
+        risk.insert("cvar".into(), share);
     }
-}
-
-/// Puts `over` over `base`, table by table.
-fn merge(base: &mut Table, over: Table) {
-    for (key, value) in over {
-        match (base.get_mut(&key), value) {
-            (Some(Value::Table(base)), Value::Table(over)) => merge(base, over),
-            (_, value) => {
-                base.insert(key, value);
-            }
+    for (key, value) in table.iter_mut() {
+        if let Value::Table(inner) = value {
+            upgrade_table(key, inner);
         }
     }
 }
 
 /// One line of what is wrong with a configuration; for an unknown field, with the closest known one.
-fn bad_config(path: &Path, problem: &toml::de::Error) -> Error {
+pub(crate) fn bad_config(path: &Path, problem: &toml::de::Error) -> Error {
     let message = problem.message();
     let mut names = message.split('`').skip(1).step_by(2);
     let problem = match (message.starts_with("unknown field"), names.next()) {

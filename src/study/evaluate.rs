@@ -1,4 +1,4 @@
-//! The protocol by which every agent is judged: the same starts for all, deterministic actions.
+//! The evaluation protocol: the same initial states for every method, deterministic actions.
 
 use std::time::Instant;
 
@@ -6,28 +6,29 @@ use serde::{Deserialize, Serialize};
 
 use super::smoothness;
 use super::statistics::{deviation, mean, wilson};
-use crate::agent::{Agent, Slot};
+use crate::agent::{Policy, Slot};
+use crate::env::Env;
 use crate::env::vector::VectorEnv;
-use crate::env::{Env, World};
 use crate::error::{Error, Result};
 use crate::model::open_loop::Episode;
 
-/// Worlds that are stepped side by side; agents answer for all of them in one pass.
-const WORLDS: usize = 20;
+/// Environments that are stepped side by side; agents act in all of them in one forward pass.
+const ENVS: usize = 20;
 
-/// Which starts an evaluation has. No training episode shares them.
+/// Which seeds, and so which initial states, an evaluation has. Training episodes share none of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EvalSeeds {
     /// Those of the evaluations during training.
     Training,
-    /// Those of the test at the end: never seen before.
+    /// Those of the test at the end, which nothing else uses.
     Test,
-    /// Those that follow from a seed of the user's.
+    /// Those derived from a seed of the user's.
     Seed(u64),
 }
 
 impl EvalSeeds {
-    fn seed(self, episode: usize) -> u64 {
+    /// The seed of an episode: what [`Env::reset`] is given.
+    pub fn seed(self, episode: usize) -> u64 {
         let base = match self {
             EvalSeeds::Training => 1 << 40,
             EvalSeeds::Test => 2 << 40,
@@ -112,84 +113,92 @@ impl Evaluation {
     }
 }
 
-/// Worlds of one kind, kept for many evaluations.
-pub struct Evaluator {
-    worlds: VectorEnv<World>,
+/// Evaluates policies in environments of one kind, which are kept for many evaluations.
+#[derive(Debug)]
+pub struct Evaluator<E> {
+    envs: VectorEnv<E>,
 }
 
-impl Evaluator {
-    /// A judge with worlds made by `make`.
+impl<E: Env> Evaluator<E> {
+    /// An evaluator with environments made by `make`.
     ///
     /// # Errors
-    /// What `make` answers.
-    pub fn new(make: impl Fn() -> Result<World> + Sync) -> Result<Self> {
-        make()?;
-        Ok(Self { worlds: VectorEnv::new(WORLDS, || make().expect("what was made once can be made again")) })
+    /// What `make` answers, or what is wrong with the environment's spec.
+    pub fn new(make: impl Fn() -> Result<E> + Sync) -> Result<Self> {
+        make()?.spec().check()?;
+        Ok(Self { envs: VectorEnv::new(ENVS, || make().expect("what was made once can be made again")) })
     }
 
-    /// Lets the agent act in `episodes` episodes from the given starts.
+    /// Lets the policy act in `episodes` episodes with the given seeds.
     ///
     /// # Errors
-    /// If there are no episodes, or the agent's actions cannot be taken.
-    pub fn evaluate(&mut self, agent: &mut dyn Agent, episodes: usize, starts: EvalSeeds) -> Result<Evaluation> {
+    /// If there are no episodes, the environment cannot take the policy's actions, or it breaks its contract.
+    pub fn evaluate<P: Policy + ?Sized>(
+        &mut self,
+        policy: &mut P,
+        episodes: usize,
+        seeds: EvalSeeds,
+    ) -> Result<Evaluation> {
         let mut evaluation = Evaluation::default();
-        while !self.next_batch(&mut evaluation, agent, episodes, starts)? {}
+        while !self.next_batch(&mut evaluation, policy, episodes, seeds)? {}
         Ok(evaluation)
     }
 
-    /// Adds to an evaluation of so many episodes the next group of those that are played side by side, and answers whether
-    /// these were the last: for whoever wants to see, or to keep, what there is before the end.
+    /// Adds to an evaluation of `episodes` episodes the next batch of those that run side by side, and answers whether
+    /// that was the last: for a caller that wants to show, or to save, the results so far.
     ///
     /// # Errors
     /// As for [`Evaluator::evaluate`].
-    pub fn next_batch(
+    pub fn next_batch<P: Policy + ?Sized>(
         &mut self,
         evaluation: &mut Evaluation,
-        agent: &mut dyn Agent,
+        policy: &mut P,
         episodes: usize,
-        starts: EvalSeeds,
+        seeds: EvalSeeds,
     ) -> Result<bool> {
         if episodes == 0 {
             return Err(Error::BadSetting("an evaluation needs at least one episode".into()));
         }
         let done = evaluation.results.len();
-        let seeds: Vec<u64> = (done..episodes.min(done + WORLDS)).map(|i| starts.seed(i)).collect();
+        let seeds: Vec<u64> = (done..episodes.min(done + ENVS)).map(|i| seeds.seed(i)).collect();
         if !seeds.is_empty() {
-            self.side_by_side(evaluation, agent, &seeds)?;
+            self.side_by_side(evaluation, policy, &seeds)?;
         }
         Ok(evaluation.results.len() >= episodes)
     }
 
-    fn side_by_side(&mut self, evaluation: &mut Evaluation, agent: &mut dyn Agent, seeds: &[u64]) -> Result<()> {
-        let dt = self.worlds.envs()[0].spec().dt;
-        let mut observations = self.worlds.reset(seeds);
-        let mut paths: Vec<Vec<[f64; 3]>> =
-            self.worlds.envs().iter().take(seeds.len()).map(|world| world.hand().into_iter().collect()).collect();
+    fn side_by_side<P: Policy + ?Sized>(
+        &mut self,
+        evaluation: &mut Evaluation,
+        policy: &mut P,
+        seeds: &[u64],
+    ) -> Result<()> {
+        let mut observations = self.envs.reset(seeds)?;
+        let count = seeds.len();
+        let mut paths: Vec<Vec<[f64; 3]>> = (0..count).map(|i| self.envs.env(i).hand().into_iter().collect()).collect();
         let blank = EpisodeResult { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
-        let mut results = vec![blank; seeds.len()];
-        let mut running: Vec<usize> = (0..seeds.len()).collect();
-        let starts = observations.iter().map(|obs| Episode { observations: vec![obs.clone()], ..Episode::default() });
-        let mut recorded: Vec<Episode> = starts.collect();
-        let slot = Slot { index: 0, first: true, obs: &observations[0], world: &self.worlds.envs()[0] };
-        evaluation.action_ms = time_of_action(agent, slot);
+        let mut results = vec![blank; count];
+        let recorded = observations.iter().map(|obs| Episode { observations: vec![obs.clone()], ..Episode::default() });
+        let mut recorded: Vec<Episode> = recorded.collect();
+        evaluation.action_ms = time_of_action(policy, Slot::single(true, &observations[0], self.envs.env(0)))?;
+        let mut running: Vec<usize> = (0..count).collect();
         let mut first = true;
         while !running.is_empty() {
-            let envs = self.worlds.envs();
-            let slots = running.iter().map(|&i| Slot { index: i, first, obs: &observations[i], world: &envs[i] });
-            let slots: Vec<Slot> = slots.collect();
-            let mut actions = vec![None; seeds.len()];
-            for (&i, action) in running.iter().zip(agent.act_all(&slots)) {
+            let slot = |&index: &usize| Slot { index, first, obs: &observations[index], env: self.envs.env(index) };
+            let slots: Vec<Slot> = running.iter().map(slot).collect();
+            let mut actions = vec![None; self.envs.len()];
+            for (&i, action) in running.iter().zip(policy.actions(&slots)?) {
                 actions[i] = Some(action);
             }
             first = false;
-            for (i, step) in self.worlds.step(&actions)?.into_iter().enumerate() {
+            for (i, step) in self.envs.step(&actions)?.into_iter().enumerate() {
                 let Some(step) = step else { continue };
                 let result = &mut results[i];
                 result.total += f64::from(step.reward);
                 result.success = step.success;
                 result.length += 1;
                 result.stage = result.stage.max(step.stage);
-                paths[i].extend(self.worlds.envs()[i].hand());
+                paths[i].extend(self.envs.env(i).hand());
                 recorded[i].observations.push(step.observation.clone());
                 recorded[i].actions.extend(actions[i].clone());
                 recorded[i].rewards.push(step.reward);
@@ -200,6 +209,7 @@ impl Evaluator {
                 observations[i] = step.observation;
             }
         }
+        let dt = self.envs.env(0).spec().dt;
         for (result, path) in results.iter_mut().zip(&paths) {
             if let Some((sparc, ldlj)) = smoothness::of_path(path, dt) {
                 (result.sparc, result.ldlj) = (Some(sparc), Some(ldlj));
@@ -211,15 +221,14 @@ impl Evaluator {
     }
 }
 
-/// Milliseconds that one action takes at the start of an episode: the median of a few.
-fn time_of_action(agent: &mut dyn Agent, slot: Slot) -> f64 {
-    let mut times: Vec<f64> = (0..5)
-        .map(|_| {
-            let start = Instant::now();
-            std::hint::black_box(agent.act_all(&[slot]));
-            start.elapsed().as_secs_f64() * 1e3
-        })
-        .collect();
+/// Milliseconds that one action takes at the start of an episode: the median of five.
+fn time_of_action<P: Policy + ?Sized>(policy: &mut P, slot: Slot) -> Result<f64> {
+    let mut times = [0.0; 5];
+    for time in &mut times {
+        let start = Instant::now();
+        std::hint::black_box(policy.actions(&[slot])?);
+        *time = start.elapsed().as_secs_f64() * 1e3;
+    }
     times.sort_by(f64::total_cmp);
-    times[2]
+    Ok(times[2])
 }

@@ -14,8 +14,9 @@ use serde::{Deserialize, Serialize};
 use super::config::RunConfig;
 use super::evaluate::{EvalSeeds, Evaluation, Evaluator, Summary};
 use super::statistics::{correlation, mean};
-use crate::agent::{Agent, Expectation, Mode};
-use crate::env::{Env, World};
+use crate::agent::{Losses, Method, Mode, ValueEstimate};
+use crate::env::Env;
+use crate::env::contract::Checked;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::model::open_loop::OpenLoop;
@@ -91,16 +92,9 @@ pub struct LossRow {
 pub struct ModelRow {
     /// Environment steps so far.
     pub step: usize,
-    /// See [`OpenLoop`].
-    pub horizon: usize,
-    /// See [`OpenLoop`].
-    pub rmse: f64,
-    /// See [`OpenLoop`].
-    pub nll: f64,
-    /// See [`OpenLoop`].
-    pub coverage90: f64,
-    /// See [`OpenLoop`].
-    pub rmse_p90: f64,
+    /// The errors.
+    #[serde(flatten)]
+    pub open_loop: OpenLoop,
 }
 
 /// A row of `values.csv`: what the agent expected of the last evaluation's episodes, and what came.
@@ -119,7 +113,7 @@ pub struct ValueRow {
 }
 
 impl ValueRow {
-    fn new(step: usize, moments: &[Expectation]) -> Option<Self> {
+    fn new(step: usize, moments: &[ValueEstimate]) -> Option<Self> {
         let expected: Vec<f64> = moments.iter().map(|moment| f64::from(moment.expected)).collect();
         let realised: Vec<f64> = moments.iter().map(|moment| f64::from(moment.realised)).collect();
         let square = |(e, r): (&f64, &f64)| (e - r).powi(2);
@@ -168,13 +162,13 @@ pub enum Event {
     Tested(Evaluation),
 }
 
-/// A run in progress. Whoever holds it decides when to step, to save, and to stop.
-pub struct Run {
+/// A run in progress. Its owner decides when to step, to save, and to stop.
+pub struct Run<E> {
     config: RunConfig,
     folder: PathBuf,
-    world: World,
-    evaluator: Evaluator,
-    agent: Box<dyn Agent>,
+    env: Checked<E>,
+    evaluator: Evaluator<E>,
+    method: Method,
     progress: Progress,
     obs: Vec<f32>,
     episode_return: f64,
@@ -184,14 +178,20 @@ pub struct Run {
     last_save: Instant,
 }
 
-impl Run {
-    /// EvalSeeds a run in `folder`, or goes on with the one that is there.
+impl<E: Env> Run<E> {
+    /// Starts a run of a method in `folder`, in environments that `make` makes; or resumes the one that is there.
     ///
     /// # Errors
     /// If the folder holds a run with other settings, a damaged checkpoint, or cannot be written.
-    pub fn open(config: RunConfig, folder: &Path) -> Result<Self> {
-        // Whatever is wrong with the settings shows before anything is written.
-        let (mut agent, world) = (config.agent()?, config.world()?);
+    pub fn open(
+        config: RunConfig,
+        mut method: Method,
+        make: impl Fn() -> Result<E> + Sync,
+        folder: &Path,
+    ) -> Result<Self> {
+        config.check()?;
+        // Whatever is wrong with the environment shows before anything is written.
+        let (env, evaluator) = (Checked::new(make()?), Evaluator::new(make)?);
         let config_path = folder.join("config.toml");
         if config_path.exists() {
             let there = RunConfig::read(&config_path)?;
@@ -202,16 +202,14 @@ impl Run {
                 ));
             }
         } else {
-            let text = toml::to_string(&config).expect("a configuration is TOML");
-            files::write(&config_path, text.as_bytes())?;
+            files::write(&config_path, config.to_toml().as_bytes())?;
         }
         let checkpoint = folder.join("checkpoint").join("state.safetensors");
-        let progress = if checkpoint.exists() { load(&checkpoint, agent.as_mut())? } else { Progress::default() };
-        let make = || config.world();
+        let progress = if checkpoint.exists() { load(&checkpoint, &mut method)? } else { Progress::default() };
         let mut run = Self {
-            world,
-            evaluator: Evaluator::new(make)?,
-            agent,
+            env,
+            evaluator,
+            method,
             obs: Vec::new(),
             episode_return: 0.0,
             episode_length: 0,
@@ -222,7 +220,7 @@ impl Run {
             last_save: Instant::now(),
             config,
         };
-        run.start_episode();
+        run.start_episode()?;
         Ok(run)
     }
 
@@ -257,9 +255,12 @@ impl Run {
         if step >= budget {
             return self.test();
         }
-        let action = self.agent.act(&self.obs, Mode::Explore);
-        let outcome = self.world.step(&action)?;
-        self.agent.observe(&Transition {
+        let Some(agent) = self.method.as_learner() else {
+            return Err(Error::BadSetting(format!("{} does not learn: its `steps` must be 0", self.config.agent)));
+        };
+        let action = agent.act(&self.obs, Mode::Explore);
+        let outcome = self.env.step(&action)?;
+        agent.observe(&Transition {
             obs: std::mem::take(&mut self.obs),
             action,
             reward: outcome.reward,
@@ -267,11 +268,11 @@ impl Run {
             terminated: outcome.terminated,
             truncated: outcome.truncated,
         });
+        let losses = agent.update().unwrap_or_default();
         self.obs.clone_from(&outcome.observation);
         self.progress.step += 1;
         self.episode_return += f64::from(outcome.reward);
         self.episode_length += 1;
-        let losses = self.agent.update().unwrap_or_default();
         self.note(losses);
         if !outcome.done() {
             return Ok(Event::Stepped);
@@ -285,25 +286,29 @@ impl Run {
             seconds: self.seconds(),
         };
         self.progress.episodes.push(row.clone());
-        self.start_episode();
+        self.start_episode()?;
         if self.last_save.elapsed() > CHECKPOINT_EVERY {
             self.save()?;
         }
         Ok(Event::EpisodeEnded(row))
     }
 
-    fn start_episode(&mut self) {
+    fn start_episode(&mut self) -> Result<()> {
         // Seeds of different runs lie 2^20 episodes apart.
         let seed = (self.config.seed << 20) + self.progress.episodes.len() as u64;
-        self.obs = self.world.reset(seed);
+        self.obs = self.env.reset(seed)?;
+        if let Some(agent) = self.method.as_learner() {
+            agent.begin_episode();
+        }
         (self.episode_return, self.episode_length) = (0.0, 0);
+        Ok(())
     }
 
     fn seconds(&self) -> f64 {
         self.progress.seconds + self.clock.elapsed().as_secs_f64()
     }
 
-    fn note(&mut self, losses: crate::agent::Losses) {
+    fn note(&mut self, losses: Losses) {
         let Progress { step, losses: rows, pending, .. } = &mut self.progress;
         for (name, value) in losses {
             let (sum, count) = pending.entry(name.into()).or_default();
@@ -316,28 +321,22 @@ impl Run {
     }
 
     fn evaluate(&mut self) -> Result<Event> {
-        let episodes = self.config.evaluation_episodes;
-        let evaluation = self.evaluator.evaluate(self.agent.as_mut(), episodes, EvalSeeds::Training)?;
-        let row = EvaluationRow::new(self.progress.step, evaluation.summary());
-        let model = self.agent.judge_model(&evaluation.episodes).into_iter();
-        let step = self.progress.step;
-        self.progress.model.extend(model.map(|OpenLoop { horizon, rmse, nll, coverage90, rmse_p90 }| ModelRow {
-            step,
-            horizon,
-            rmse,
-            nll,
-            coverage90,
-            rmse_p90,
-        }));
-        self.progress.values.extend(ValueRow::new(step, &self.agent.judge_values(&evaluation.episodes)));
+        let (step, episodes) = (self.progress.step, self.config.evaluation_episodes);
+        let evaluation = self.evaluator.evaluate(&mut self.method, episodes, EvalSeeds::Training)?;
+        let row = EvaluationRow::new(step, evaluation.summary());
+        if let Some(agent) = self.method.as_learner() {
+            let open_loop = agent.open_loop(&evaluation.episodes).into_iter();
+            self.progress.model.extend(open_loop.map(|open_loop| ModelRow { step, open_loop }));
+            self.progress.values.extend(ValueRow::new(step, &agent.value_estimates(&evaluation.episodes)));
+        }
         self.evaluated_at = Some(self.progress.step);
         self.progress.evaluations.push(row.clone());
         Ok(Event::Evaluated(row))
     }
 
     fn test(&mut self) -> Result<Event> {
-        let (test, agent) = (&mut self.progress.test, self.agent.as_mut());
-        let complete = self.evaluator.next_batch(test, agent, self.config.test_episodes, EvalSeeds::Test)?;
+        let (test, episodes) = (&mut self.progress.test, self.config.test_episodes);
+        let complete = self.evaluator.next_batch(test, &mut self.method, episodes, EvalSeeds::Test)?;
         self.save()?;
         let test = &self.progress.test;
         if !complete {
@@ -360,8 +359,8 @@ impl Run {
         self.progress.seconds += self.clock.elapsed().as_secs_f64();
         self.clock = Instant::now();
         self.last_save = self.clock;
-        let weights = self.agent.weights();
-        let mut state = self.agent.training_state();
+        let weights = self.method.checkpoint().weights();
+        let mut state = self.method.checkpoint().training_state();
         state.absorb("weights.", &weights);
         // TOML, since JSON has no word for a likelihood or a loss that is not a number.
         state.set_note("progress", toml::to_string(&self.progress).expect("progress is TOML"));
@@ -371,7 +370,8 @@ impl Run {
         }
         let Progress { episodes, evaluations, losses, model, values, .. } = &self.progress;
         if !model.is_empty() {
-            write_csv(&self.folder.join("model.csv"), &MODEL_COLUMNS, model.iter())?;
+            let rows = model.iter().map(|row| (row.step, &row.open_loop));
+            write_csv(&self.folder.join("model.csv"), &MODEL_COLUMNS, rows)?;
         }
         if !values.is_empty() {
             write_csv(&self.folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
@@ -394,22 +394,7 @@ pub fn is_complete(folder: &Path) -> bool {
     folder.join("summary.toml").exists()
 }
 
-/// The agent that a run in `folder` has learned.
-///
-/// # Errors
-/// If there is no run, or its weights are missing or damaged.
-pub fn trained_agent(folder: &Path) -> Result<(RunConfig, Box<dyn Agent>)> {
-    let config = RunConfig::read(&folder.join("config.toml"))?;
-    let mut agent = config.agent()?;
-    if config.learns() {
-        let path = folder.join("weights.safetensors");
-        let weights = Weights::read(&path)?;
-        agent.load_weights(&weights).map_err(|problem| Error::bad_file(&path, problem))?;
-    }
-    Ok((config, agent))
-}
-
-fn load(path: &Path, agent: &mut dyn Agent) -> Result<Progress> {
+fn load(path: &Path, method: &mut Method) -> Result<Progress> {
     let foreign = |problem: Error| {
         Error::bad_file(path, format!("not a checkpoint of this run ({problem}); remove it to start anew"))
     };
@@ -417,15 +402,15 @@ fn load(path: &Path, agent: &mut dyn Agent) -> Result<Progress> {
     let progress = state.note("progress").ok_or_else(|| foreign(Error::BadSetting("it tells no progress".into())))?;
     let progress = toml::from_str(progress)
         .map_err(|problem| foreign(Error::BadSetting(format!("its progress: {}", problem.message()))))?;
-    agent.load_weights(&state.extract("weights.")).map_err(foreign)?;
-    agent.load_training_state(&state).map_err(foreign)?;
+    let checkpoint = method.checkpoint_mut();
+    checkpoint.load_weights(&state.extract("weights.")).map_err(foreign)?;
+    checkpoint.load_training_state(&state).map_err(foreign)?;
     Ok(progress)
 }
 
 /// The first setting in which two configurations differ.
 fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
-    let [there, wanted] = [there, wanted].map(|c| toml::Table::try_from(c).expect("a configuration is TOML"));
-    difference_in("", &there, &wanted)
+    difference_in("", &there.to_table(), &wanted.to_table())
 }
 
 fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
@@ -454,19 +439,21 @@ fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<It
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::env::Task;
+    use crate::study::registry::Registry;
 
     #[test]
     fn a_run_resumes_from_what_is_not_a_number() {
         let folder = tempfile::tempdir().expect("a folder");
-        let config = RunConfig::new(Task::Pendulum, "debug", 0, None, None).expect("a preset");
-        let mut run = Run::open(config.clone(), folder.path()).expect("a new run");
+        let registry = Registry::standard();
+        let config = registry.config("pendulum", "debug", 0, None, None).expect("a preset");
+        let mut run = registry.open_run(&config, folder.path()).expect("a new run");
         let loss = LossRow { step: 1, name: "critic".into(), value: f32::NAN };
-        let model = ModelRow { step: 1, horizon: 1, rmse: 0.1, nll: f64::INFINITY, coverage90: 0.9, rmse_p90: 0.3 };
+        let open_loop = OpenLoop { horizon: 1, rmse: 0.1, nll: f64::INFINITY, coverage90: 0.9, rmse_p90: 0.3 };
+        let model = ModelRow { step: 1, open_loop };
         run.progress.losses.push(loss);
         run.progress.model.push(model.clone());
         run.save().expect("a writable folder");
-        let again = Run::open(config, folder.path()).expect("a run to go on with").progress;
+        let again = registry.open_run(&config, folder.path()).expect("a run to go on with").progress;
         assert!(again.losses[0].value.is_nan());
         assert_eq!(again.model, [model]);
     }

@@ -43,7 +43,7 @@ impl Tables {
             let labelled = |file: &str| -> Result<LazyFrame> {
                 let frame = read(&folder.join(file))?.lazy();
                 Ok(frame.select([
-                    lit(config.task.name()).alias("task"),
+                    lit(config.task.as_str()).alias("task"),
                     lit(config.method.as_str()).alias("method"),
                     lit(config.seed).alias("seed"),
                     all().as_expr(),

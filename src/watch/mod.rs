@@ -5,10 +5,11 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::agent::{Agent, ImaginedTrajectory, Slot};
+use crate::agent::{ImaginedTrajectory, Policy, Slot};
+use crate::env::Env;
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
-use crate::env::scene::Body;
-use crate::env::{Env, World};
+use crate::env::contract::Checked;
+use crate::env::scene::{Body, Camera};
 use crate::error::Result;
 use crate::files;
 
@@ -26,22 +27,16 @@ pub struct Recording {
     camera: Camera,
     bodies: Vec<DrawnBody>,
     frames: Vec<Frame>,
-    /// For each frame the futures that the agent weighed up there.
+    /// For each frame the trajectories that the agent imagined there.
     paths: Vec<Vec<Path3>>,
 }
 
-/// A future: where it leads, how good it looks (0 to 1 within its frame), how unsure it is.
+/// An imagined trajectory: its points, its value (0 to 1 within its frame), the models' disagreement about it.
 #[derive(Clone, Debug, Serialize)]
 struct Path3 {
     points: Vec<[f64; 3]>,
     value: f64,
     spread: f64,
-}
-
-#[derive(Clone, Debug, Serialize)]
-struct Camera {
-    eye: [f64; 3],
-    target: [f64; 3],
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -70,33 +65,30 @@ struct Frame {
 }
 
 impl Recording {
-    /// Lets an agent act, at its best, in the episode of that seed.
+    /// Lets a policy act, as in an evaluation, in the episode of that seed.
     ///
     /// # Errors
-    /// If the world cannot take the agent's actions.
-    pub fn of_episode(title: String, world: &mut World, agent: &mut dyn Agent, seed: u64) -> Result<Self> {
-        let mut obs = world.reset(seed);
-        let bodies = world.scene().iter().map(drawn).collect();
-        let rest = vec![0.0; world.spec().action_size];
-        let mut frames = vec![Frame { poses: poses(world), reward: 0.0, success: false, action: rest }];
+    /// If the environment cannot take the policy's actions, or breaks its contract.
+    pub fn of_episode<E: Env, P: Policy + ?Sized>(title: String, env: E, policy: &mut P, seed: u64) -> Result<Self> {
+        env.spec().check()?;
+        let mut env = Checked::new(env);
+        let mut obs = env.reset(seed)?;
+        let bodies = env.env().scene().iter().map(drawn).collect();
+        let rest = vec![0.0; env.env().spec().action_size];
+        let mut frames = vec![Frame { poses: poses(env.env()), reward: 0.0, success: false, action: rest }];
         let mut paths = Vec::new();
         loop {
-            let slot = Slot { index: 0, first: frames.len() == 1, obs: &obs, world };
-            let (action, futures) = agent.act_and_show(&slot);
-            paths.push(drawn_futures(world, &futures));
-            let step = world.step(&action)?;
-            frames.push(Frame { poses: poses(world), reward: step.reward, success: step.success, action });
+            let slot = Slot::single(frames.len() == 1, &obs, env.env());
+            let (action, trajectories) = policy.explained_action(&slot)?;
+            paths.push(drawn_trajectories(env.env(), &trajectories));
+            let step = env.step(&action)?;
+            frames.push(Frame { poses: poses(env.env()), reward: step.reward, success: step.success, action });
             if step.done() {
                 break;
             }
             obs = step.observation;
         }
-        let camera = match world {
-            World::Tabletop(_) => Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] },
-            World::Pendulum(_) => Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] },
-            World::CartPole(_) => Camera { eye: [0.8, -4.6, 1.6], target: [0.0, 0.0, 0.9] },
-        };
-        let spec = world.spec();
+        let (spec, camera) = (env.env().spec(), env.env().camera());
         Ok(Self { title, task: spec.name.clone(), dt: spec.dt, up: "z", camera, bodies, frames, paths })
     }
 
@@ -154,20 +146,20 @@ impl Recording {
     }
 }
 
-/// Futures as lines in the world, their values scaled to lie between 0 and 1.
-fn drawn_futures(world: &World, futures: &[ImaginedTrajectory]) -> Vec<Path3> {
-    let values = || futures.iter().map(|future| f64::from(future.value)).filter(|value| value.is_finite());
+/// Imagined trajectories as lines, their values scaled to lie between 0 and 1.
+fn drawn_trajectories(env: &impl Env, trajectories: &[ImaginedTrajectory]) -> Vec<Path3> {
+    let values = || trajectories.iter().map(|trajectory| f64::from(trajectory.value)).filter(|value| value.is_finite());
     let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
-    let drawn = futures.iter().filter(|future| future.value.is_finite()).map(|future| Path3 {
-        points: future.observations.iter().filter_map(|obs| world.place_of(obs)).map(|p| p.map(round)).collect(),
-        value: (f64::from(future.value) - low) / (high - low).max(1e-9),
-        spread: f64::from(future.disagreement),
+    let drawn = trajectories.iter().filter(|trajectory| trajectory.value.is_finite()).map(|trajectory| Path3 {
+        points: trajectory.observations.iter().filter_map(|obs| env.position_of(obs)).map(|p| p.map(round)).collect(),
+        value: (f64::from(trajectory.value) - low) / (high - low).max(1e-9),
+        spread: f64::from(trajectory.disagreement),
     });
     drawn.filter(|path| path.points.iter().flatten().all(|x| x.is_finite())).collect()
 }
 
-fn poses(world: &World) -> Vec<[f64; 7]> {
-    world.poses().iter().map(numbers).collect()
+fn poses(env: &impl Env) -> Vec<[f64; 7]> {
+    env.poses().iter().map(numbers).collect()
 }
 
 fn numbers(pose: &Pose) -> [f64; 7] {

@@ -24,7 +24,7 @@ use super::arm::{ArmDescription, JointVector, Pose};
 use super::kinematics::Kinematics;
 use super::osc::{Goal, OperationalSpaceController};
 use super::physics::{CONTROL_HZ, JointState, Physics, STEPS_PER_CONTROL, TABLE_HALF, TABLE_TOP, TIMESTEP};
-use super::scene::Body;
+use super::scene::{Body, Camera};
 use super::{Env, Feature, KnownReward, Snapshot, Spec, Step, arm::Primitive};
 use crate::error::Result;
 use crate::rng;
@@ -129,18 +129,14 @@ impl Tabletop {
             compact: Vec::new(),
             physics: empty.clone(),
         };
+        let action_size = match options.action {
+            ActionKind::Hand => 4,
+            ActionKind::Pose => 7,
+        };
+        let horizon = options.horizon.unwrap_or(task.horizon());
         let mut tabletop = Self {
-            spec: Spec {
-                name: task.name().into(),
-                observation: Vec::new(),
-                action_size: match options.action {
-                    ActionKind::Hand => 4,
-                    ActionKind::Pose => 7,
-                },
-                horizon: options.horizon.unwrap_or(task.horizon()),
-                dt: 1.0 / CONTROL_HZ,
-                stages: task.stages().iter().map(ToString::to_string).collect(),
-            },
+            spec: Spec::new(task.name(), [], action_size, horizon, 1.0 / CONTROL_HZ)
+                .stages(task.stages().iter().copied()),
             home_orientation: goal.orientation,
             options,
             task,
@@ -283,14 +279,9 @@ impl Env for Tabletop {
         self.state.elapsed += 1;
         let observation = self.observe();
         let outcome = self.task.outcome(&self.state.compact);
-        Ok(Step {
-            observation,
-            reward: self.reward_of(outcome),
-            terminated: false,
-            truncated: self.state.elapsed >= self.spec.horizon,
-            success: outcome.success,
-            stage: outcome.stage,
-        })
+        let truncated = self.state.elapsed >= self.spec.horizon;
+        let step = Step::new(observation, self.reward_of(outcome)).truncated(truncated);
+        Ok(step.success(outcome.success).stage(outcome.stage))
     }
 
     fn hand(&self) -> Option<[f64; 3]> {
@@ -326,6 +317,16 @@ impl Env for Tabletop {
         let goal = state.setup.goal.map(|goal| Pose::translation(goal.x, goal.y, goal.z));
         state.physics.arm_poses().chain([hand, table]).chain(objects).chain(goal).collect()
     }
+
+    fn camera(&self) -> Camera {
+        Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] }
+    }
+
+    /// The hand, if observations are compact.
+    fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
+        let compact = self.options.observation == ObservationKind::Compact;
+        compact.then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
+    }
 }
 
 impl KnownReward for Tabletop {
@@ -350,12 +351,6 @@ impl Snapshot for Tabletop {
 }
 
 impl Tabletop {
-    /// Where the hand is (m) in a state that is observed so, if observations are compact.
-    pub(super) fn hand_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
-        let compact = self.options.observation == ObservationKind::Compact;
-        compact.then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
-    }
-
     /// Acceleration of the arm's joints over the last physics step, rad/s2.
     fn joint_acceleration(&self, joints: &JointState) -> JointVector {
         (joints.qd - self.state.measured_qd) / TIMESTEP

@@ -6,13 +6,13 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use handful::study::config::RunConfig;
-use handful::study::plan::Observer;
-use handful::study::run::Event;
+use crate::study::config::RunConfig;
+use crate::study::run::Event;
+use crate::study::runner::StudyObserver;
 use indicatif::{MultiProgress, ProgressBar, ProgressState, ProgressStyle};
 
 /// Shows how the runs of a study go.
-pub struct Progress {
+pub(super) struct Progress {
     bars: MultiProgress,
     runs: Vec<Mutex<Shown>>,
     on_terminal: bool,
@@ -29,7 +29,7 @@ struct Shown {
 
 impl Progress {
     /// For these runs.
-    pub fn new(runs: &[(RunConfig, PathBuf)]) -> Self {
+    pub(super) fn new(runs: &[(RunConfig, PathBuf)]) -> Self {
         let shown = |config: &RunConfig| Shown {
             name: format!("{} {} seed {}", config.task, config.method, config.seed),
             bar: None,
@@ -45,7 +45,7 @@ impl Progress {
     }
 
     /// Takes the bars away.
-    pub fn finish(&self) {
+    pub(super) fn finish(&self) {
         let _ = self.bars.clear();
     }
 }
@@ -60,7 +60,7 @@ impl Shown {
     }
 }
 
-impl Observer for Progress {
+impl StudyObserver for Progress {
     fn started(&self, run: usize, config: &RunConfig, done: usize) {
         let mut shown = self.runs[run].lock().expect("no panic holds it");
         let bar = if config.learns() {

@@ -5,14 +5,14 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use super::config::RunConfig;
-use super::run::{self, Event, Run};
-use crate::env::Task;
+use super::registry::Registry;
+use super::run::{self, Event};
 use crate::error::{Error, Result};
 
 /// How much a study takes on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Profile {
-    /// A few minutes: `reach`, two seeds.
+    /// A few minutes: what [`Registry::quick_study`] says, two seeds.
     Quick,
     /// The whole comparison: hours.
     Full,
@@ -22,7 +22,7 @@ pub enum Profile {
 #[derive(Clone, Debug)]
 pub struct StudyPlan {
     /// The tasks.
-    pub tasks: Vec<Task>,
+    pub tasks: Vec<String>,
     /// The methods, by the names of their presets.
     pub methods: Vec<String>,
     /// The seeds of each.
@@ -32,18 +32,16 @@ pub struct StudyPlan {
 }
 
 impl StudyPlan {
-    /// What a profile takes on, unless told otherwise.
-    pub fn new(profile: Profile, folder: PathBuf) -> Self {
-        let named = |methods: &[&str]| methods.iter().map(ToString::to_string).collect();
+    /// What a profile takes on.
+    pub fn new(registry: &Registry, profile: Profile, folder: PathBuf) -> Self {
+        let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
         match profile {
-            Profile::Quick => Self {
-                tasks: vec![Task::Reach],
-                methods: named(&["random", "scripted", "oracle", "pets", "dreamer", "sac"]),
-                seeds: 0..2,
-                folder,
-            },
+            Profile::Quick => {
+                let [tasks, methods] = registry.quick_study.clone();
+                Self { tasks, methods, seeds: 0..2, folder }
+            }
             Profile::Full => Self {
-                tasks: vec![Task::Reach, Task::Push, Task::Lift],
+                tasks: named(&["reach", "push", "lift"]),
                 methods: named(&["random", "scripted", "oracle", "pets", "dreamer", "sac"]),
                 seeds: 0..5,
                 folder,
@@ -55,7 +53,7 @@ impl StudyPlan {
     ///
     /// # Errors
     /// If there is nothing to run, or a method or task is unknown.
-    pub fn runs(&self) -> Result<Vec<(RunConfig, PathBuf)>> {
+    pub fn runs(&self, registry: &Registry) -> Result<Vec<(RunConfig, PathBuf)>> {
         if self.seeds.is_empty() {
             return Err(Error::BadSetting(format!(
                 "no seeds in {}..{}; give a number of seeds, or a range like 0..5",
@@ -66,13 +64,13 @@ impl StudyPlan {
             return Err(Error::BadSetting("a study needs at least one task and one method".into()));
         }
         let mut runs = Vec::new();
-        for &task in &self.tasks {
+        for task in &self.tasks {
             for method in &self.methods {
                 for seed in self.seeds.clone() {
-                    let config = RunConfig::new(task, method, seed, None, None)?;
+                    let config = registry.config(task, method, seed, None, None)?;
                     // Finds out now, not hours later, whether the method can be used for the task.
-                    config.agent()?;
-                    let folder = self.folder.join(task.name()).join(method).join(format!("seed{seed}"));
+                    registry.method(&config)?;
+                    let folder = self.folder.join(task).join(method).join(format!("seed{seed}"));
                     let learns = config.learns();
                     runs.push((config, folder));
                     if !learns {
@@ -85,8 +83,8 @@ impl StudyPlan {
     }
 }
 
-/// Someone who wants to know how the runs go. Calls come from several threads.
-pub trait Observer: Sync {
+/// Is told how the runs go. Calls come from several threads.
+pub trait StudyObserver: Sync {
     /// A run begins, or goes on after `done` steps.
     fn started(&self, run: usize, config: &RunConfig, done: usize);
     /// Something happened in a run that has done so many steps.
@@ -99,20 +97,28 @@ pub trait Observer: Sync {
 /// # Errors
 /// What the run answers, and [`Error::Interrupted`].
 pub fn carry_out(
+    registry: &Registry,
     index: usize,
     config: &RunConfig,
     folder: &Path,
-    observer: &dyn Observer,
+    observer: &dyn StudyObserver,
     stop: &AtomicBool,
 ) -> Result<()> {
-    let mut run = Run::open(config.clone(), folder)?;
+    let mut run = registry.open_run(config, folder)?;
     observer.started(index, config, run.steps_done());
     loop {
         if stop.load(Ordering::Relaxed) && run.between_episodes() {
             run.save()?;
             return Err(Error::Interrupted);
         }
-        let event = run.step()?;
+        let event = match run.step() {
+            Ok(event) => event,
+            Err(problem) => {
+                // What was learned so far is kept, if it can be; the first error is the one to tell.
+                let _ = run.save();
+                return Err(problem);
+            }
+        };
         observer.happened(index, config, run.steps_done(), &event);
         if matches!(event, Event::Tested(_)) {
             return Ok(());
@@ -125,9 +131,10 @@ pub fn carry_out(
 /// # Errors
 /// The first error of a run; the others are then stopped and saved.
 pub fn carry_out_all(
+    registry: &Registry,
     runs: &[(RunConfig, PathBuf)],
     jobs: usize,
-    observer: &dyn Observer,
+    observer: &dyn StudyObserver,
     stop: &AtomicBool,
 ) -> Result<()> {
     let next = AtomicUsize::new(0);
@@ -147,7 +154,7 @@ pub fn carry_out_all(
                         continue;
                     }
                     let index = runs.iter().position(|(_, other)| other == folder).expect("a run of this study");
-                    if let Err(error) = pool.install(|| carry_out(index, config, folder, observer, stop)) {
+                    if let Err(error) = pool.install(|| carry_out(registry, index, config, folder, observer, stop)) {
                         // First the reason, then the signal: the others will answer that they were interrupted.
                         failure.lock().expect("no panic holds it").get_or_insert(error);
                         stop.store(true, Ordering::Relaxed);

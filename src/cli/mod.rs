@@ -1,0 +1,81 @@
+//! The command line: train, resume, evaluate, compare, report and watch, for everything in a [`Registry`].
+//!
+//! The program `handful` is this with [`Registry::standard`]; a program of one's own registers more and calls [`main`].
+
+mod evaluate;
+mod progress;
+mod report;
+mod study;
+mod train;
+mod watch;
+
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clap::{Parser, Subcommand};
+use console::style;
+
+use crate::error::{Error, Result};
+use crate::study::registry::Registry;
+
+/// Model-based reinforcement learning on a robot arm. Without a command: the quick study.
+#[derive(Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Compare methods on tasks: train, test, draw, report. Resumes where it stopped.
+    Study(study::Args),
+    /// Train one agent. Resumes where it stopped.
+    Train(train::Args),
+    /// Test a trained agent.
+    Evaluate(evaluate::Args),
+    /// Make tables, figures and report.md anew from a study's CSV files.
+    Report(report::Args),
+    /// Write an episode as one HTML file with a 3D replay.
+    Watch(watch::Args),
+}
+
+/// Carries out the command that the program was called with. The answer is the program's exit code: 0, 2 after an error,
+/// 130 after an interruption.
+pub fn main(registry: &Registry) -> ExitCode {
+    let cli = Cli::parse();
+    let stop = Arc::new(AtomicBool::new(false));
+    let outcome = stop_on_ctrl_c(&stop).and_then(|()| match cli.command {
+        None => study::run(registry, study::Args::default(), &stop),
+        Some(Command::Study(args)) => study::run(registry, args, &stop),
+        Some(Command::Train(args)) => train::run(registry, args, &stop),
+        Some(Command::Evaluate(args)) => evaluate::run(registry, &args),
+        Some(Command::Report(args)) => report::run(&args),
+        Some(Command::Watch(args)) => watch::run(registry, &args),
+    });
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Error::Interrupted) => {
+            eprintln!("{}", Error::Interrupted);
+            ExitCode::from(130)
+        }
+        Err(error) => {
+            eprintln!("{} {error}", style("error:").red().bold().for_stderr());
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// The first Ctrl-C asks runs to finish their episode (in a test, the batch of episodes that run side by side) and to
+/// save; the second ends the program.
+fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> Result<()> {
+    let stop = Arc::clone(stop);
+    ctrlc::set_handler(move || {
+        if stop.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("\nfinishing the episodes that have begun and saving; press Ctrl-C again to quit at once");
+    })
+    .map_err(|problem| Error::BadSetting(format!("cannot watch for Ctrl-C: {problem}")))
+}

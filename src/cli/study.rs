@@ -1,0 +1,87 @@
+//! `study`: compare methods on tasks.
+
+use std::num::NonZeroUsize;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use super::progress::Progress;
+use crate::error::Result;
+use crate::study::config::RunConfig;
+use crate::study::registry::Registry;
+use crate::study::runner::{self, Profile, StudyPlan};
+
+#[derive(clap::Args)]
+pub(super) struct Args {
+    /// How much to take on
+    #[arg(long, value_enum, default_value_t = ProfileArg::Quick)]
+    profile: ProfileArg,
+    /// Tasks, separated by commas
+    #[arg(long, value_delimiter = ',')]
+    tasks: Option<Vec<String>>,
+    /// Methods, separated by commas
+    #[arg(long, value_delimiter = ',')]
+    methods: Option<Vec<String>>,
+    /// How many seeds, or a range like 0..5
+    #[arg(long, value_parser = seed_range)]
+    seeds: Option<Range<u64>>,
+    /// Runs at a time; as many as there are cores if left out
+    #[arg(long)]
+    jobs: Option<NonZeroUsize>,
+    /// Where to write everything [default: runs/PROFILE]
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+impl Default for Args {
+    fn default() -> Self {
+        Self { profile: ProfileArg::Quick, tasks: None, methods: None, seeds: None, jobs: None, out: None }
+    }
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum ProfileArg {
+    /// A few minutes
+    Quick,
+    /// Hours
+    Full,
+}
+
+pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<()> {
+    let (profile, name) = match args.profile {
+        ProfileArg::Quick => (Profile::Quick, "quick"),
+        ProfileArg::Full => (Profile::Full, "full"),
+    };
+    let folder = args.out.unwrap_or_else(|| Path::new("runs").join(name));
+    let mut plan = StudyPlan::new(registry, profile, folder);
+    plan.tasks = args.tasks.unwrap_or(plan.tasks);
+    plan.methods = args.methods.unwrap_or(plan.methods);
+    plan.seeds = args.seeds.unwrap_or(plan.seeds);
+    let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
+    let runs = plan.runs(registry)?;
+    let progress = Progress::new(&runs);
+    runner::carry_out_all(registry, &runs, jobs, &progress, stop)?;
+    progress.finish();
+    conclude(&runs, &plan.folder)
+}
+
+fn seed_range(text: &str) -> Result<Range<u64>, String> {
+    let bad = |_| String::from("give a number of seeds, or a range like 0..5");
+    match text.split_once("..") {
+        Some((from, to)) => Ok(from.parse().map_err(bad)?..to.parse().map_err(bad)?),
+        None => Ok(0..text.parse().map_err(bad)?),
+    }
+}
+
+#[cfg(feature = "study")]
+fn conclude(runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+    let tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
+    tables.write(folder)?;
+    super::report::write(folder, folder)
+}
+
+#[cfg(not(feature = "study"))]
+fn conclude(_runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+    println!("the runs are in {}; build with the feature `study` for tables and figures", folder.display());
+    Ok(())
+}

@@ -1,0 +1,57 @@
+//! `train`: one run.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use super::progress::Progress;
+use crate::error::{Error, Result};
+use crate::study::config::RunConfig;
+use crate::study::registry::Registry;
+use crate::study::{run, runner};
+
+#[derive(clap::Args)]
+pub(super) struct Args {
+    /// The task: reach, push, lift, stack, pendulum, cartpole, or one that was registered
+    #[arg(long)]
+    task: String,
+    /// The method: a preset, like sac
+    #[arg(long)]
+    method: String,
+    /// Environment steps; the preset's number if left out
+    #[arg(long)]
+    steps: Option<usize>,
+    /// The seed of everything random
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// A TOML file with settings that differ from the preset
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// The run's folder [default: runs/TASK-METHOD-seedN]
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<()> {
+    let Args { task, method, steps, seed, config, out } = args;
+    let config = registry.config(&task, &method, seed, steps, config.as_deref())?;
+    let folder = out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{method}-seed{seed}")));
+    if run::is_complete(&folder) && RunConfig::read(&folder.join("config.toml"))? == config {
+        println!("this run is complete: {}", folder.display());
+        return print_test(&folder);
+    }
+    let runs = vec![(config, folder)];
+    let progress = Progress::new(&runs);
+    let (config, folder) = &runs[0];
+    // Inside the thread pool, so that parallel pieces of an update need no hand-over.
+    rayon::scope(|_| runner::carry_out(registry, 0, config, folder, &progress, stop))?;
+    progress.finish();
+    print_test(folder)
+}
+
+fn print_test(folder: &Path) -> Result<()> {
+    let path = folder.join("summary.toml");
+    let text = std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
+    print!("{text}");
+    println!("run: {}", folder.display());
+    Ok(())
+}

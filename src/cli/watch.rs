@@ -1,0 +1,52 @@
+//! `watch`: an episode as a 3D replay.
+
+use std::path::PathBuf;
+
+use crate::error::{Error, Result};
+use crate::study::registry::Registry;
+use crate::watch::Recording;
+
+#[derive(clap::Args)]
+pub(super) struct Args {
+    /// A run's folder
+    #[arg(long, required_unless_present = "task", conflicts_with = "task")]
+    run: Option<PathBuf>,
+    /// A task, for a policy that needs no training
+    #[arg(long)]
+    task: Option<String>,
+    /// That policy: scripted or random
+    #[arg(long, default_value = "scripted", conflicts_with = "run")]
+    policy: String,
+    /// The episode's seed
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// The file [default: NAME.html]
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
+    let (config, mut method, default) = match (&args.run, &args.task) {
+        (Some(folder), _) => {
+            let (config, method) = registry.trained_method(folder)?;
+            (config, method, folder.join("watch.html"))
+        }
+        (None, Some(task)) => {
+            let policy = args.policy.as_str();
+            if !["scripted", "random"].contains(&policy) {
+                return Err(Error::unknown("policy", policy, ["scripted", "random"]));
+            }
+            let config = registry.config(task, policy, args.seed, None, None)?;
+            let method = registry.method(&config)?;
+            (config, method, PathBuf::from(format!("{task}-{policy}.html")))
+        }
+        (None, None) => unreachable!("the command line asks for one of them"),
+    };
+    let title = format!("{}, {}, seed {}", config.task, config.method, args.seed);
+    let recording = Recording::of_episode(title, registry.make_env(&config)?, &mut method, args.seed)?;
+    let path = args.out.clone().unwrap_or(default);
+    recording.write(&path)?;
+    let outcome = if recording.success() { "success" } else { "no success" };
+    println!("{} steps, {outcome}; open {} in a browser", recording.steps(), path.display());
+    Ok(())
+}

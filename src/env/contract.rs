@@ -1,0 +1,123 @@
+//! The contract of an environment, and a wrapper that enforces it.
+//!
+//! [`Checked`] wraps any [`Env`] and refuses, with an [`Error::Contract`] that names the environment, the step and the
+//! rule, whatever would otherwise surface much later as a NaN loss or an index out of bounds:
+//!
+//! - the [`Spec`](super::Spec) makes sense ([`Spec::check`](super::Spec::check), asked at every reset);
+//! - observations have [`Spec::observation_size`](super::Spec::observation_size) numbers, all of them finite;
+//! - rewards are finite;
+//! - the stage is at most the number of [`Spec::stages`](super::Spec::stages);
+//! - episodes end within [`Spec::horizon`](super::Spec::horizon) steps, terminated or truncated;
+//! - a step follows a reset, and none follows the end of an episode.
+//!
+//! ```
+//! use handful::env::contract::Checked;
+//! use handful::prelude::*;
+//!
+//! /// Its observation is one number longer than its spec says.
+//! struct Wrong(Spec);
+//!
+//! impl Env for Wrong {
+//!     fn spec(&self) -> &Spec { &self.0 }
+//!     fn reset(&mut self, _seed: u64) -> Vec<f32> { vec![0.0, 1.0] }
+//!     fn step(&mut self, _action: &[f32]) -> Result<Step> { Ok(Step::new(vec![0.0, 1.0], 0.0)) }
+//! }
+//!
+//! let mut env = Checked::new(Wrong(Spec::new("wrong", [Feature::new("x")], 1, 10, 0.1)));
+//! let error = env.reset(0).unwrap_err().to_string();
+//! assert!(error.contains("the observation at the reset has 2 numbers, the spec names 1"), "{error}");
+//! ```
+
+use super::{Env, Step};
+use crate::error::{Error, Result};
+
+/// An environment whose contract is enforced. See the [module](self) for the rules.
+#[derive(Clone, Debug)]
+pub struct Checked<E> {
+    env: E,
+    /// Steps in this episode; None before the first reset and after the end of an episode.
+    elapsed: Option<usize>,
+}
+
+impl<E: Env> Checked<E> {
+    /// The environment, its contract enforced from the next reset on.
+    pub fn new(env: E) -> Self {
+        Self { env, elapsed: None }
+    }
+
+    /// The environment.
+    pub fn env(&self) -> &E {
+        &self.env
+    }
+
+    /// The environment itself. Who resets it or steps it there does so unchecked, and the steps are not counted.
+    pub fn env_mut(&mut self) -> &mut E {
+        &mut self.env
+    }
+
+    /// The environment, unwrapped.
+    pub fn into_inner(self) -> E {
+        self.env
+    }
+
+    /// [`Env::reset`].
+    ///
+    /// # Errors
+    /// [`Error::BadSetting`] if the spec makes no sense, [`Error::Contract`] if the first observation breaks a rule.
+    pub fn reset(&mut self, seed: u64) -> Result<Vec<f32>> {
+        self.elapsed = None;
+        self.env.spec().check()?;
+        let obs = self.env.reset(seed);
+        self.check_observation(&obs, "the reset")?;
+        self.elapsed = Some(0);
+        Ok(obs)
+    }
+
+    /// [`Env::step`]. Steps are counted from 1 in every episode.
+    ///
+    /// # Errors
+    /// What [`Env::step`] answers, after which the episode goes on; [`Error::Contract`] if a rule is broken, after which
+    /// only a reset helps.
+    pub fn step(&mut self, action: &[f32]) -> Result<Step> {
+        let Some(elapsed) = self.elapsed else {
+            return self.broken("a step before the first reset, or after the end of an episode; reset first".into());
+        };
+        let step = self.env.step(action)?;
+        self.elapsed = None;
+        let (count, spec) = (elapsed + 1, self.env.spec());
+        self.check_observation(&step.observation, &format!("step {count}"))?;
+        if !step.reward.is_finite() {
+            return self.broken(format!("the reward at step {count} is {}", step.reward));
+        }
+        if step.stage > spec.stages.len() {
+            let (stage, stages) = (step.stage, spec.stages.len());
+            return self.broken(format!("the stage at step {count} is {stage}, the spec names {stages} stages"));
+        }
+        if !step.done() {
+            if count >= spec.horizon {
+                let horizon = spec.horizon;
+                return self.broken(format!(
+                    "step {count} neither terminated nor truncated the episode, the spec's horizon is {horizon} steps"
+                ));
+            }
+            self.elapsed = Some(count);
+        }
+        Ok(step)
+    }
+
+    fn check_observation(&self, obs: &[f32], at: &str) -> Result<()> {
+        let features = &self.env.spec().observation;
+        if obs.len() != features.len() {
+            let (has, named) = (obs.len(), features.len());
+            return self.broken(format!("the observation at {at} has {has} numbers, the spec names {named}"));
+        }
+        match obs.iter().zip(features).find(|(x, _)| !x.is_finite()) {
+            Some((x, feature)) => self.broken(format!("`{}` in the observation at {at} is {x}", feature.name)),
+            None => Ok(()),
+        }
+    }
+
+    fn broken<T>(&self, rule: String) -> Result<T> {
+        Err(Error::Contract { env: self.env.spec().name.clone(), rule })
+    }
+}

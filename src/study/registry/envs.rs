@@ -1,0 +1,147 @@
+//! Registered environments.
+
+use std::marker::PhantomData;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use toml::Table;
+
+use super::Registry;
+use crate::agent::{Method, Oracle, OracleConfig, Scripted};
+use crate::env::tabletop::{ObservationKind, TableOptions};
+use crate::env::{Env, KnownReward, Snapshot, Task};
+use crate::error::{Error, Result};
+
+/// Settings that are read from TOML and written to it with all defaults filled in.
+pub trait Settings: Serialize + DeserializeOwned + Default + Send + Sync + 'static {}
+
+impl<S: Serialize + DeserializeOwned + Default + Send + Sync + 'static> Settings for S {}
+
+/// The options of an environment, or the settings of an agent, that has none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoOptions {}
+
+/// A known reward, shared between threads.
+pub(super) type SharedReward = Arc<dyn KnownReward + Send + Sync>;
+type Make<O, T> = Arc<dyn Fn(&O) -> Result<T> + Send + Sync>;
+type MakeOracle<O> = Arc<dyn Fn(&O, OracleConfig, u64) -> Result<Method> + Send + Sync>;
+
+/// An environment to be registered: how to make it, and what else can be had of it. `O` are its options, which stand in
+/// the table `[env]` of a preset or configuration file.
+pub struct EnvEntry<E, O = NoOptions> {
+    name: String,
+    make: Make<O, E>,
+    known_reward: Option<Make<O, Option<SharedReward>>>,
+    oracle: Option<MakeOracle<O>>,
+    scripted: Option<Make<O, Scripted>>,
+    env: PhantomData<fn() -> E>,
+}
+
+impl<E: Env> EnvEntry<E> {
+    /// An environment without options.
+    pub fn new(name: &str, make: impl Fn() -> Result<E> + Send + Sync + 'static) -> Self {
+        Self::with_options(name, move |_: &NoOptions| make())
+    }
+}
+
+impl<E: Env, O: Settings> EnvEntry<E, O> {
+    /// An environment with options.
+    pub fn with_options(name: &str, make: impl Fn(&O) -> Result<E> + Send + Sync + 'static) -> Self {
+        let make = Arc::new(make);
+        Self { name: name.into(), make, known_reward: None, oracle: None, scripted: None, env: PhantomData }
+    }
+
+    /// Its reward is known as a function of observations: agents that plan need not learn it.
+    #[must_use]
+    pub fn with_known_reward(self) -> Self
+    where
+        E: KnownReward + Sync,
+    {
+        self.with_known_reward_if(|_| true)
+    }
+
+    /// The same, for some of its options only.
+    #[must_use]
+    pub fn with_known_reward_if(mut self, known: impl Fn(&O) -> bool + Send + Sync + 'static) -> Self
+    where
+        E: KnownReward + Sync,
+    {
+        let make = self.make.clone();
+        self.known_reward = Some(Arc::new(move |options: &O| {
+            Ok(if known(options) { Some(Arc::new(make(options)?) as SharedReward) } else { None })
+        }));
+        self
+    }
+
+    /// It can be restored, so that the oracle can plan in it.
+    #[must_use]
+    pub fn with_oracle(mut self) -> Self
+    where
+        E: Snapshot,
+    {
+        let make = self.make.clone();
+        self.oracle = Some(Arc::new(move |options: &O, config, seed| {
+            Ok(Method::fixed(Oracle::new(|| make(options), config, seed)?))
+        }));
+        self
+    }
+
+    /// There is a hand-written policy for it.
+    #[must_use]
+    pub fn with_scripted(mut self, policy: impl Fn(&O) -> Result<Scripted> + Send + Sync + 'static) -> Self {
+        self.scripted = Some(Arc::new(policy));
+        self
+    }
+}
+
+/// The table of settings with all defaults filled in.
+pub(super) fn completed<S: Settings>(table: Table) -> Result<Table, toml::de::Error> {
+    let settings: S = table.try_into()?;
+    Ok(Table::try_from(settings).expect("settings are TOML"))
+}
+
+fn parsed<S: Settings>(table: &Table) -> Result<S> {
+    table.clone().try_into().map_err(|problem: toml::de::Error| Error::BadSetting(problem.message().into()))
+}
+
+type Erased<T> = Box<dyn Fn(&Table) -> Result<T> + Send + Sync>;
+
+/// An [`EnvEntry`] without its types.
+pub(super) struct ErasedEnv {
+    pub(super) name: String,
+    pub(super) complete: fn(Table) -> Result<Table, toml::de::Error>,
+    pub(super) make: Erased<Box<dyn Env>>,
+    pub(super) known_reward: Option<Erased<Option<SharedReward>>>,
+    #[allow(clippy::type_complexity)] // a closure's type, named once
+    pub(super) oracle: Option<Box<dyn Fn(&Table, OracleConfig, u64) -> Result<Method> + Send + Sync>>,
+    pub(super) scripted: Option<Erased<Scripted>>,
+}
+
+impl<E: Env, O: Settings> EnvEntry<E, O> {
+    pub(super) fn erased(self) -> ErasedEnv {
+        let Self { name, make, known_reward, oracle, scripted, .. } = self;
+        ErasedEnv {
+            name,
+            complete: completed::<O>,
+            make: Box::new(move |options| Ok(Box::new(make(&parsed(options)?)?))),
+            known_reward: known_reward.map(|make| Box::new(move |o: &Table| make(&parsed(o)?)) as Erased<_>),
+            oracle: oracle.map(|make| {
+                Box::new(move |options: &Table, config: OracleConfig, seed: u64| make(&parsed(options)?, config, seed))
+                    as Box<_>
+            }),
+            scripted: scripted.map(|make| Box::new(move |o: &Table| make(&parsed(o)?)) as Erased<_>),
+        }
+    }
+}
+
+/// The tasks of this crate.
+pub(super) fn register(registry: Registry) -> Registry {
+    Task::ALL.into_iter().fold(registry, |registry, task| {
+        let entry = EnvEntry::with_options(task.name(), move |options: &TableOptions| task.make_with(*options))
+            .with_known_reward_if(|options| options.observation == ObservationKind::Compact)
+            .with_oracle();
+        let scripted = task.scripted_policy(TableOptions::default()).is_some();
+        registry.env(if scripted { entry.with_scripted(move |o| Scripted::of_task(task, *o)) } else { entry })
+    })
+}

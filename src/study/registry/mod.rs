@@ -1,0 +1,235 @@
+//! The environments, agents and presets that the command line and a study know by name.
+//!
+//! [`Registry::standard`] holds those of this crate. A program of one's own adds to it and hands it to the command line
+//! (feature `cli`), which then trains, resumes, evaluates, compares and draws them as it does ours:
+//!
+//! ```no_run
+//! # use handful::prelude::*;
+//! # struct Puck; impl Puck { fn new() -> Self { Puck } }
+//! # impl Env for Puck { fn spec(&self) -> &Spec { todo!() } fn reset(&mut self, _: u64) -> Vec<f32> { todo!() }
+//! #   fn step(&mut self, _: &[f32]) -> Result<Step> { todo!() } }
+//! # impl KnownReward for Puck { fn reward(&self, _: &[f32], _: &[f32], _: &[f32]) -> f32 { todo!() } }
+//! # impl Snapshot for Puck { type State = (); fn snapshot(&self) {} fn restore(&mut self, _: &()) {} }
+//! # #[cfg(feature = "cli")]
+//! fn main() -> std::process::ExitCode {
+//!     let puck = EnvEntry::new("puck", || Ok(Puck::new())).with_known_reward().with_oracle();
+//!     handful::cli::main(&Registry::standard().env(puck))
+//! }
+//! ```
+
+mod agents;
+mod envs;
+
+use std::path::Path;
+
+use toml::{Table, Value};
+
+pub use agents::AgentContext;
+use agents::AgentEntry;
+use envs::ErasedEnv;
+pub use envs::{EnvEntry, NoOptions, Settings};
+
+use super::config::{RunConfig, bad_config, upgrade_keys};
+use super::run::Run;
+use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, merge, preset_table, specialise};
+use crate::env::Env;
+use crate::error::{Error, Result};
+use crate::nn::Weights;
+
+/// Environments, agents and presets by name.
+pub struct Registry {
+    envs: Vec<ErasedEnv>,
+    agents: Vec<AgentEntry>,
+    presets: Vec<(String, String)>,
+    /// Tasks and methods of the quick study.
+    pub(super) quick_study: [Vec<String>; 2],
+}
+
+impl Registry {
+    /// The tasks, agents and presets of this crate.
+    pub fn standard() -> Self {
+        let presets = PRESETS.iter().map(|(name, text)| (name.to_string(), text.to_string())).collect();
+        let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: [Vec::new(), Vec::new()] };
+        agents::register(envs::register(registry))
+            .quick_study(&["reach"], &["random", "scripted", "oracle", "pets", "dreamer", "sac"])
+    }
+
+    /// Adds an environment; one of the same name is replaced.
+    #[must_use]
+    pub fn env<E: Env, O: Settings>(mut self, entry: EnvEntry<E, O>) -> Self {
+        let entry = entry.erased();
+        self.envs.retain(|other| other.name != entry.name);
+        self.envs.push(entry);
+        self
+    }
+
+    /// Adds an agent that learns, with settings of the type `C` (which stand in the table `[name]` of a preset or
+    /// configuration file); one of the same name is replaced. A method of the same name comes with it, whose settings
+    /// are the defaults and which trains for 10,000 steps, unless a preset of that name is there.
+    #[must_use]
+    pub fn agent<C, A>(self, name: &str, make: impl Fn(&AgentContext, C) -> Result<A> + Send + Sync + 'static) -> Self
+    where
+        C: Settings,
+        A: Learner + 'static,
+    {
+        let make = move |context: &AgentContext, settings: C| Ok(Method::learner(make(context, settings)?));
+        self.add_agent(AgentEntry::new(name, true, make))
+    }
+
+    /// Adds a policy that does not learn, in the same way. It is only tested.
+    #[must_use]
+    pub fn policy<C, P>(self, name: &str, make: impl Fn(&AgentContext, C) -> Result<P> + Send + Sync + 'static) -> Self
+    where
+        C: Settings,
+        P: Policy + Checkpoint + 'static,
+    {
+        let make = move |context: &AgentContext, settings: C| Ok(Method::fixed(make(context, settings)?));
+        self.add_agent(AgentEntry::new(name, false, make))
+    }
+
+    /// Says what the quick study compares: that is what a program does that is called without a command.
+    #[must_use]
+    pub fn quick_study(mut self, tasks: &[&str], methods: &[&str]) -> Self {
+        self.quick_study = [tasks, methods].map(|names| names.iter().map(ToString::to_string).collect());
+        self
+    }
+
+    fn add_agent(mut self, entry: AgentEntry) -> Self {
+        if self.presets.iter().all(|(name, _)| *name != entry.name) {
+            let steps = if entry.learns { 10_000 } else { 0 };
+            self.presets.push((entry.name.clone(), format!("agent = \"{}\"\nsteps = {steps}\n", entry.name)));
+        }
+        self.agents.retain(|other| other.name != entry.name);
+        self.agents.push(entry);
+        self
+    }
+
+    /// Adds a method: a preset in TOML, in the form of the files in `data/presets`; one of the same name is replaced.
+    #[must_use]
+    pub fn preset(mut self, method: &str, toml: &str) -> Self {
+        self.presets.retain(|(name, _)| name != method);
+        self.presets.push((method.into(), toml.into()));
+        self
+    }
+
+    /// The names of all environments.
+    pub fn env_names(&self) -> impl Iterator<Item = &str> {
+        self.envs.iter().map(|entry| entry.name.as_str())
+    }
+
+    /// The names of all methods.
+    pub fn method_names(&self) -> impl Iterator<Item = &str> {
+        self.presets.iter().map(|(name, _)| name.as_str())
+    }
+
+    /// The configuration of a run: a method's preset for a task, changed by a file of the same form if one is given, and
+    /// by `steps` if it is given. All defaults are filled in.
+    ///
+    /// # Errors
+    /// If task or method are unknown, the file cannot be read, or a field or value in it is wrong.
+    pub fn config(
+        &self,
+        task: &str,
+        method: &str,
+        seed: u64,
+        steps: Option<usize>,
+        file: Option<&Path>,
+    ) -> Result<RunConfig> {
+        self.env_entry(task)?;
+        let mut table = preset_table(&self.presets, task, method)?;
+        if let Some(path) = file {
+            let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
+            let mut changes: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+            specialise(&mut changes, task);
+            // Otherwise an old name would stand beside the new one that the preset uses.
+            upgrade_keys(&mut changes);
+            merge(&mut table, changes);
+        }
+        table.insert("task".into(), Value::String(task.into()));
+        table.insert("method".into(), Value::String(method.into()));
+        table.insert("seed".into(), Value::Integer(seed as i64));
+        if let Some(steps) = steps {
+            table.insert("steps".into(), Value::Integer(steps as i64));
+        }
+        let path = file.unwrap_or(Path::new(method));
+        let mut config = RunConfig::from_table(table).map_err(|problem| bad_config(path, &problem))?;
+        self.complete(&mut config).map_err(|problem| bad_config(path, &problem))??;
+        Ok(config)
+    }
+
+    /// Fills in the defaults of environment and agent.
+    fn complete(&self, config: &mut RunConfig) -> Result<Result<()>, toml::de::Error> {
+        let (env, agent) = match (self.env_entry(&config.task), self.agent_entry(&config.agent)) {
+            (Ok(env), Ok(agent)) => (env, agent),
+            (Err(problem), _) | (_, Err(problem)) => return Ok(Err(problem)),
+        };
+        config.env = (env.complete)(std::mem::take(&mut config.env))?;
+        config.settings = (agent.complete)(std::mem::take(&mut config.settings))?;
+        if !agent.learns {
+            config.steps = 0;
+        }
+        Ok(config.check())
+    }
+
+    /// The environment of a run.
+    ///
+    /// # Errors
+    /// If the task is unknown, or the options do not suit it.
+    pub fn make_env(&self, config: &RunConfig) -> Result<Box<dyn Env>> {
+        (self.env_entry(&config.task)?.make)(&config.env)
+    }
+
+    /// The method of a run, before it has learned anything.
+    ///
+    /// # Errors
+    /// If task or agent are unknown, a setting cannot be used, or the agent cannot be used on the task.
+    pub fn method(&self, config: &RunConfig) -> Result<Method> {
+        let (env, agent) = (self.env_entry(&config.task)?, self.agent_entry(&config.agent)?);
+        let spec = (env.make)(&config.env)?.spec().clone();
+        spec.check()?;
+        let context = AgentContext { spec: &spec, seed: config.seed, env, options: &config.env };
+        (agent.make)(&context, config.settings.clone())
+    }
+
+    /// Starts a run in `folder`, or resumes the one that is there.
+    ///
+    /// # Errors
+    /// As [`Run::open`].
+    pub fn open_run(&self, config: &RunConfig, folder: &Path) -> Result<Run<Box<dyn Env>>> {
+        Run::open(config.clone(), self.method(config)?, || self.make_env(config), folder)
+    }
+
+    /// The method of the run in `folder`, with what it has learned.
+    ///
+    /// # Errors
+    /// If there is no run, or its weights are missing or damaged.
+    pub fn trained_method(&self, folder: &Path) -> Result<(RunConfig, Method)> {
+        let path = folder.join("config.toml");
+        let mut config = RunConfig::read(&path)?;
+        self.complete(&mut config).map_err(|problem| bad_config(&path, &problem))??;
+        let mut method = self.method(&config)?;
+        if config.learns() {
+            let path = folder.join("weights.safetensors");
+            let weights = Weights::read(&path)?;
+            method.checkpoint_mut().load_weights(&weights).map_err(|problem| Error::bad_file(&path, problem))?;
+        }
+        Ok((config, method))
+    }
+
+    fn env_entry(&self, name: &str) -> Result<&ErasedEnv> {
+        let found = self.envs.iter().find(|entry| entry.name == name);
+        found.ok_or_else(|| Error::unknown("task", name, self.env_names()))
+    }
+
+    fn agent_entry(&self, name: &str) -> Result<&AgentEntry> {
+        let found = self.agents.iter().find(|entry| entry.name == name);
+        found.ok_or_else(|| Error::unknown("agent", name, self.agents.iter().map(|entry| entry.name.as_str())))
+    }
+}
+
+impl std::fmt::Debug for Registry {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let (envs, methods) = (self.env_names().collect::<Vec<_>>(), self.method_names().collect::<Vec<_>>());
+        f.debug_struct("Registry").field("envs", &envs).field("methods", &methods).finish_non_exhaustive()
+    }
+}
