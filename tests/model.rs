@@ -249,7 +249,7 @@ fn latent_models_foresee_too() {
         wrong += (told - truth).abs() / episode.actions.len() as f32;
     }
     assert!(wrong < 0.15, "rewards between -3 and 0 are told to {wrong}");
-    assert!((world.continues(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
+    assert!((world.continuations(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
 }
 
 /// The tape's gradients against central differences, for known and for learned rewards.

@@ -16,6 +16,7 @@ pub mod norm;
 pub mod ops;
 pub(crate) mod parameters;
 pub mod recurrent;
+pub mod tape;
 pub mod two_hot;
 
 pub use crate::checkpoint::Weights;
@@ -31,6 +32,7 @@ pub use ops::{Grad, Tensor2, Tensor3, values, values_mut};
 pub(crate) use parameters::parameters_of_fields;
 pub use parameters::{Parameters, copy_parameters, polyak};
 pub use recurrent::BlockDense;
+pub use tape::TapeOps;
 pub use two_hot::SymexpBins;
 
 use dfdx::tensor::{Cache, Cpu, TensorFrom};
