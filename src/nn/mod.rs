@@ -19,6 +19,7 @@ pub mod recurrent;
 pub mod two_hot;
 mod weights;
 
+pub(crate) use adam::adam_step;
 pub use adam::{Adam, AdamConfig};
 pub use categorical::Categorical;
 pub use dfdx;
