@@ -80,7 +80,7 @@
 //! | 1 | [`replay`] | transitions, episodes, replay buffers |
 //! | 0 | [`env`](mod@env) | environments: the arm at its table, pendulum, cart-pole |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
-//! | 0 | [`rng`], [`files`], [`error`] | weights in files, random numbers, files that are written whole, errors |
+//! | 0 | [`checkpoint`], [`rng`], [`files`], [`error`] | weights in files, random numbers, files that are written whole, errors |
 //! | 0 | `chart` | charts for chapters, examples and reports (feature `figures`) |
 //!
 //! What holds everywhere:
@@ -95,6 +95,7 @@
 pub mod agent;
 #[cfg(feature = "figures")]
 pub mod chart;
+pub mod checkpoint;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod diff;
@@ -108,6 +109,9 @@ pub mod replay;
 pub mod rng;
 pub mod study;
 pub mod watch;
+
+/// Vectors, matrices and rotations: the crate that poses, Jacobians and differentiable systems here are made of.
+pub use nalgebra;
 
 /// What most programs that use this crate need.
 pub mod prelude {

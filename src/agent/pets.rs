@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::warm_up::RandomActions;
 use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots};
+use crate::checkpoint::Weights;
 use crate::env::{KnownReward, Spec};
 use crate::error::{Error, Result};
 use crate::model::open_loop::{Episode, OpenLoop, open_loop};
@@ -16,7 +17,6 @@ use crate::model::uncertainty::Risk;
 use crate::model::{
     Differentiable, Dynamics, Ensemble, EnsembleConfig, Imagination, ImaginedReturns, Propagation, Reward, Value,
 };
-use crate::nn::Weights;
 use crate::plan::{
     ActionSequences, ControlConfig, IcemConfig, Iteration, Objective, PlanObserver, PlannerConfig, RecedingHorizon,
 };

@@ -17,7 +17,7 @@ const NOISE: f64 = 1e-3;
 
 /// A push as it was seen, once each control step, the start included.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Recording {
+pub struct RecordedPush {
     /// Where the hand was, m.
     pub hand: Vec<[f64; 2]>,
     /// Where the block was, m, and its angle, rad.
@@ -44,7 +44,7 @@ struct Residuals {
     slopes: Vec<SVector<f64, 2>>,
 }
 
-impl Recording {
+impl RecordedPush {
     /// Finds mass and friction near `guess`, whose grip and stiffness are kept. The block is taken to be at rest at first. A
     /// whole trajectory has valleys that lead nowhere; so the search begins several times, a factor of three up and down too.
     pub fn identify(&self, guess: Pusher<f64>) -> Identified {

@@ -3,21 +3,23 @@
 //!
 //! A [`System`] is such a simulator with a cost to be kept low. [`derivatives`] has the Jacobians of a step and the gradients of
 //! whole roll-outs, forwards and backwards; [`Ilqr`] finds good actions with them, [`AnalyticPolicyGradient`] good policies, and
-//! [`Recording::identify`] the world's own parameters.
+//! [`RecordedPush::identify`] the world's own parameters.
 
 pub mod derivatives;
 mod identify;
 mod ilqr;
 mod policy;
 pub mod pusher;
+mod simulated;
 mod swing;
 
 use nalgebra::{RealField, SVector};
 
-pub use identify::{Identified, Recording};
+pub use identify::{Identified, RecordedPush};
 pub use ilqr::{Ilqr, IlqrConfig, IlqrControl, Solution};
-pub use policy::{AnalyticPolicyGradient, PolicyEnv, PolicySearchConfig};
+pub use policy::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PolicyEnv};
 pub use pusher::{Pusher, PusherTask};
+pub use simulated::Simulated;
 pub use swing::{CartPoleSwing, PendulumSwing};
 
 /// A world of `N` numbers that is moved by `M`, each in [-1, 1], and what it costs.

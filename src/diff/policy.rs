@@ -27,7 +27,7 @@ pub trait PolicyEnv<const N: usize, const M: usize, const O: usize>: System<N, M
 /// Settings of a [`AnalyticPolicyGradient`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct PolicySearchConfig {
+pub struct AnalyticPolicyGradientConfig {
     /// Width of each hidden layer.
     pub hidden: Vec<usize>,
     /// Step size.
@@ -43,7 +43,7 @@ pub struct PolicySearchConfig {
     pub episode: usize,
 }
 
-impl Default for PolicySearchConfig {
+impl Default for AnalyticPolicyGradientConfig {
     fn default() -> Self {
         Self { hidden: vec![64, 64], learning_rate: 2e-3, max_norm: 1.0, worlds: 4, window: 32, episode: 64 }
     }
@@ -51,7 +51,7 @@ impl Default for PolicySearchConfig {
 
 /// A policy and the worlds that it learns in.
 pub struct AnalyticPolicyGradient<const N: usize, const M: usize, const O: usize> {
-    config: PolicySearchConfig,
+    config: AnalyticPolicyGradientConfig,
     policy: Mlp,
     optimiser: Adam,
     /// Each world's state and age, steps.
@@ -62,7 +62,7 @@ pub struct AnalyticPolicyGradient<const N: usize, const M: usize, const O: usize
 
 impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M, O> {
     /// A policy that does next to nothing yet.
-    pub fn new(system: &impl PolicyEnv<N, M, O>, config: PolicySearchConfig, rng: &mut Rng) -> Self {
+    pub fn new(system: &impl PolicyEnv<N, M, O>, config: AnalyticPolicyGradientConfig, rng: &mut Rng) -> Self {
         let shape = MlpConfig {
             members: 1,
             input: O,
@@ -92,7 +92,7 @@ impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M
 
     /// One gradient step. Returns what a step has cost on average.
     pub fn update(&mut self, system: &impl PolicyEnv<N, M, O>, rng: &mut Rng) -> f32 {
-        let PolicySearchConfig { window, episode, .. } = self.config;
+        let AnalyticPolicyGradientConfig { window, episode, .. } = self.config;
         for (state, age) in self.worlds.iter_mut().filter(|(_, age)| *age >= episode) {
             (*state, *age) = (system.start(rng), 0);
         }

@@ -343,6 +343,12 @@ impl dyn Env {
 
 /// A reward that can be computed from observations alone, as planners need it.
 pub trait KnownReward {
+    /// Whether observations determine the reward at all. True by default; false for an environment that can be set to
+    /// observe too little, whose [`KnownReward::reward`] then panics.
+    fn is_known(&self) -> bool {
+        true
+    }
+
     /// The reward of reaching `next_obs` from `obs` by `action`.
     fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32;
 

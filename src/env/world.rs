@@ -1,12 +1,14 @@
 //! The worlds of this crate by name.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
 use super::arm::Pose;
 use super::cartpole::{CartPole, CartPoleState};
 use super::pendulum::{Pendulum, PendulumState};
 use super::scene::{Body, Camera};
-use super::tabletop::{ActionKind, Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
+use super::tabletop::{Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
 use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::{Error, Result};
 
@@ -45,12 +47,12 @@ impl Task {
     }
 
     /// The arm's part of the task, for tasks at the table.
-    fn at_table(self) -> Option<&'static dyn TableTask> {
+    fn at_table(self) -> Option<Arc<dyn TableTask>> {
         match self {
-            Task::Reach => Some(&Reach),
-            Task::Push => Some(&Push),
-            Task::Lift => Some(&Lift),
-            Task::Stack => Some(&Stack),
+            Task::Reach => Some(Arc::new(Reach)),
+            Task::Push => Some(Arc::new(Push)),
+            Task::Lift => Some(Arc::new(Lift)),
+            Task::Stack => Some(Arc::new(Stack)),
             Task::Pendulum | Task::Cartpole => None,
         }
     }
@@ -58,13 +60,7 @@ impl Task {
     /// The hand-written policy of an arm task: from a compact observation to an action.
     pub fn scripted_policy(self, options: TableOptions) -> Option<impl Fn(&[f32]) -> Vec<f32> + Send + use<>> {
         let task = self.at_table()?;
-        Some(move |obs: &[f32]| {
-            let [x, y, z, grip] = task.scripted(obs).map(|a| a.clamp(-1.0, 1.0) as f32);
-            match options.action {
-                ActionKind::Hand => vec![x, y, z, grip],
-                ActionKind::Pose => vec![x, y, z, 0.0, 0.0, 0.0, grip],
-            }
-        })
+        Some(move |obs: &[f32]| options.action_of_hand(task.scripted(obs).expect("our tasks have one")))
     }
 
     /// A world for the task, with default options.
@@ -78,7 +74,7 @@ impl Task {
     /// If `options` ask of a classic what only the arm can do.
     pub fn make_with(self, options: TableOptions) -> Result<World> {
         if let Some(task) = self.at_table() {
-            return Ok(World::Tabletop(Box::new(Tabletop::new(task, options))));
+            return Ok(Tabletop::with_shared(task, options)?.into());
         }
         if options != TableOptions::default() {
             return Err(Error::BadSetting(format!("{} has no options; those are for the arm's tasks", self.name())));
@@ -114,6 +110,22 @@ pub enum World {
     Pendulum(Pendulum),
     /// The cart-pole.
     CartPole(CartPole),
+}
+
+impl World {
+    /// The table, if this is an arm task.
+    pub fn tabletop(&self) -> Option<&Tabletop> {
+        match self {
+            World::Tabletop(world) => Some(world),
+            _ => None,
+        }
+    }
+}
+
+impl From<Tabletop> for World {
+    fn from(world: Tabletop) -> Self {
+        World::Tabletop(Box::new(world))
+    }
 }
 
 /// A state of any of the worlds.
@@ -173,6 +185,10 @@ impl Env for World {
 }
 
 impl KnownReward for World {
+    fn is_known(&self) -> bool {
+        delegate!(self, world => world.is_known())
+    }
+
     fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32 {
         delegate!(self, world => world.reward(obs, action, next_obs))
     }

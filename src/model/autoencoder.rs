@@ -6,7 +6,6 @@ use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
 use super::open_loop::{Episode, OpenLoopModel, actions_from};
-use super::rssm::layers_of;
 use super::view::LatentFeatures;
 use crate::env::Spec;
 use crate::nn::ops::{self, record};
@@ -48,7 +47,7 @@ impl Autoencoder {
         let cpu = device();
         let AutoencoderConfig { code, hidden } = config;
         let view = LatentFeatures::new(spec);
-        let mut mlp = |input, output| layers_of(&cpu, input, hidden, Some(output), rng);
+        let mut mlp = |input, output| Mlp::dreamer(&cpu, input, hidden, Some(output), rng);
         Self {
             encoder: mlp(view.width(), *code),
             decoder: mlp(*code, view.width()),

@@ -1,7 +1,7 @@
 //! Shifting and scaling features to mean zero and deviation one.
 
+use crate::checkpoint::Weights;
 use crate::error::Result;
-use crate::nn::Weights;
 use crate::nn::frozen::Feature;
 use crate::nn::kernels::vectorised_fn;
 

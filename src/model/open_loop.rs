@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::calibration::{GaussianForecast, coverage};
 use super::{Dynamics, Imagination, Propagation, Reward};
 use crate::env::KnownReward;
+pub use crate::replay::Episode;
 use crate::rng::Rng;
 
 /// How far ahead models are judged, in steps.
@@ -17,19 +18,6 @@ const STARTS: usize = 200;
 const PARTICLES_PER_MEMBER: usize = 4;
 /// Numbers whose displacement varies less than this share of its typical step are not judged: they stand still.
 const STILL: f64 = 1e-3;
-
-/// An episode as it happened: what was done, and what was seen before and after each action.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Episode {
-    /// Observations, one more than actions.
-    pub observations: Vec<Vec<f32>>,
-    /// Actions.
-    pub actions: Vec<Vec<f32>>,
-    /// What each action brought.
-    pub rewards: Vec<f32>,
-    /// Whether the task itself ended with the last one.
-    pub terminated: bool,
-}
 
 /// How well a model foresees a number of steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

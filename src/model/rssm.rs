@@ -15,10 +15,7 @@ use crate::error::{Error, Result};
 use crate::nn::norm::RmsNorm;
 use crate::nn::ops::{self, record};
 use crate::nn::recurrent::gru;
-use crate::nn::{
-    Activation, BlockDense, Categorical, Grad, Init, Mlp, MlpConfig, Norm, Tensor3, parameters_of_fields, tensor,
-    values,
-};
+use crate::nn::{BlockDense, Categorical, Grad, Mlp, Tensor3, parameters_of_fields, tensor, values};
 use crate::rng::Rng;
 
 /// Sizes of an [`Rssm`].
@@ -136,7 +133,7 @@ impl Rssm {
     pub fn new(cpu: &Cpu, config: &RssmConfig, actions: usize, token: usize, rng: &mut Rng) -> Self {
         let RssmConfig { deter, blocks, hidden, .. } = *config;
         let stoch = config.stoch_size();
-        let mut mlp = |input, layers: usize, output| layers_of(cpu, input, &vec![hidden; layers], output, rng);
+        let mut mlp = |input, layers: usize, output| Mlp::dreamer(cpu, input, &vec![hidden; layers], output, rng);
         let (from_memory, from_state) = (mlp(deter, 1, None), mlp(stoch, 1, None));
         let from_action = mlp(actions, 1, None);
         let (prior, posterior) = (mlp(deter, 2, Some(stoch)), mlp(deter + token, 1, Some(stoch)));
@@ -208,19 +205,4 @@ impl Rssm {
         let gates = record(tape, &mixed, |mixed| self.gates.forward(mixed, None));
         record(tape, &gates, |gates| gru(gates, &before.deter, self.config.blocks))
     }
-}
-
-/// A network in DreamerV3's manner: layers normalised by their root mean square, SiLU, and perhaps an affine layer at the
-/// end.
-pub fn layers_of(cpu: &Cpu, input: usize, hidden: &[usize], output: Option<usize>, rng: &mut Rng) -> Mlp {
-    let config = MlpConfig {
-        members: 1,
-        input,
-        hidden: hidden.to_vec(),
-        output,
-        norm: Norm::Rms,
-        activation: Activation::Silu,
-        init: Init::Lecun,
-    };
-    Mlp::new(cpu, &config, rng)
 }

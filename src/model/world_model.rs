@@ -6,7 +6,7 @@ use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
 use super::open_loop::{Episode, OpenLoopModel, actions_from};
-use super::rssm::{Latent, Rssm, RssmConfig, layers_of};
+use super::rssm::{Latent, Rssm, RssmConfig};
 use super::view::LatentFeatures;
 use crate::env::Spec;
 use crate::error::{Error, Result};
@@ -124,7 +124,7 @@ impl WorldModel {
         let hidden = vec![config.units; config.layers];
         let features = config.rssm.features();
         let view = LatentFeatures::new(spec);
-        let mut mlp = |input, hidden: &[usize], output| layers_of(&cpu, input, hidden, output, rng);
+        let mut mlp = |input, hidden: &[usize], output| Mlp::dreamer(&cpu, input, hidden, output, rng);
         let encoder = mlp(view.width(), &hidden, None);
         let decoder = mlp(features, &hidden, Some(view.width()));
         let reward = mlp(features, &hidden[..1], Some(config.bins)).scale_output(0.0);

@@ -117,6 +117,21 @@ impl Mlp {
         Self { layers: sizes.windows(2).enumerate().map(layer).collect() }
     }
 
+    /// One network in DreamerV3's manner, for `input` features: hidden layers normalised by their root mean square, SiLU,
+    /// weights drawn by [`Init::Lecun`], and an affine layer at the end if there is an `output` size.
+    pub fn dreamer(cpu: &Cpu, input: usize, hidden: &[usize], output: Option<usize>, rng: &mut Rng) -> Self {
+        let config = MlpConfig {
+            members: 1,
+            input,
+            hidden: hidden.to_vec(),
+            output,
+            norm: Norm::Rms,
+            activation: Activation::Silu,
+            init: Init::Lecun,
+        };
+        Self::new(cpu, &config, rng)
+    }
+
     /// Multiplies the weights of the last layer by `factor`: with 0, the network says the same of everything at first.
     pub fn scale_output(mut self, factor: f32) -> Self {
         let last = self.layers.last_mut().expect("a layer");

@@ -17,8 +17,8 @@ pub mod ops;
 pub(crate) mod parameters;
 pub mod recurrent;
 pub mod two_hot;
-mod weights;
 
+pub use crate::checkpoint::Weights;
 pub(crate) use adam::adam_step;
 pub use adam::{Adam, AdamConfig};
 pub use categorical::Categorical;
@@ -33,7 +33,6 @@ pub(crate) use parameters::parameters_of_fields;
 pub use parameters::{Parameters, copy_parameters, polyak};
 pub use recurrent::BlockDense;
 pub use two_hot::SymexpBins;
-pub use weights::Weights;
 
 use dfdx::tensor::{Cache, Cpu, TensorFrom};
 

@@ -1,7 +1,11 @@
 //! What learns: named parameters, and what is done with all of them at once.
 
+use dfdx::shapes::HasShape;
+
 use super::kernels;
 use super::ops::{Tensor3, values, values_mut};
+use crate::checkpoint::Weights;
+use crate::error::Result;
 
 /// Something with named parameters, each `[members, rows, columns]`.
 pub trait Parameters {
@@ -25,6 +29,35 @@ pub fn polyak<P: Parameters>(target: &mut P, source: &P, rate: f32) {
 /// Gives `target` the parameters of `source`.
 pub fn copy_parameters<P: Parameters>(target: &mut P, source: &P) {
     polyak(target, source, 1.0);
+}
+
+impl Weights {
+    /// Adds every parameter of a module, named `prefix.parameter`.
+    pub fn insert_module(&mut self, prefix: &str, module: &impl Parameters) {
+        for (name, parameter) in module.parameters() {
+            self.insert(format!("{prefix}.{name}"), values(parameter).to_vec(), sizes(parameter));
+        }
+    }
+
+    /// Gives a module the parameters stored under `prefix`. On an error nothing has changed.
+    ///
+    /// # Errors
+    /// If a parameter is missing or has another shape.
+    pub fn load_module(&self, prefix: &str, module: &mut impl Parameters) -> Result<()> {
+        for (name, parameter) in module.parameters() {
+            self.get(&format!("{prefix}.{name}"), sizes(parameter))?;
+        }
+        for (name, parameter) in module.parameters_mut() {
+            let shape = sizes(parameter);
+            parameter.copy_from(self.get(&format!("{prefix}.{name}"), shape)?);
+        }
+        Ok(())
+    }
+}
+
+fn sizes(parameter: &Tensor3) -> [usize; 3] {
+    let &(members, rows, columns) = parameter.shape();
+    [members, rows, columns]
 }
 
 pub(crate) fn under_names<T>(parts: impl IntoIterator<Item = (&'static str, Vec<(String, T)>)>) -> Vec<(String, T)> {

@@ -10,8 +10,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::noise::ColoredNoise;
 use super::cem::refit;
+use super::noise::ColoredNoise;
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::Rng;
 

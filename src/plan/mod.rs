@@ -45,7 +45,6 @@ mod icem;
 mod mppi;
 pub mod noise;
 mod shooting;
-mod simulated;
 
 pub use cem::{Cem, CemConfig};
 pub use config::PlannerConfig;
@@ -55,7 +54,6 @@ pub use hybrid::{Hybrid, HybridConfig};
 pub use icem::{Icem, IcemConfig};
 pub use mppi::{Mppi, MppiConfig};
 pub use shooting::{RandomShooting, ShootingConfig};
-pub use simulated::Simulated;
 
 use crate::rng::Rng;
 

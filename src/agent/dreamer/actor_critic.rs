@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use super::returns::{lambda_returns, replayed_returns};
 use crate::agent::Losses;
 use crate::error::{Error, Result};
-use crate::model::rssm::layers_of;
 use crate::model::{Latent, WorldModel};
 use crate::nn::ops::{self, record};
 use crate::nn::{BoundedNormal, Grad, Mlp, Tensor3, copy_parameters, parameters_of_fields, polyak, tensor, values};
@@ -99,8 +98,8 @@ impl ActorCritic {
     pub fn new(world: &WorldModel, actions: usize, config: &ActorCriticConfig, rng: &mut Rng) -> (Self, SlowCritic) {
         let hidden = vec![config.units; config.layers];
         let features = world.config().rssm.features();
-        let policy = layers_of(world.device(), features, &hidden, Some(2 * actions), rng).scale_output(0.01);
-        let critic = layers_of(world.device(), features, &hidden, Some(world.bins().count()), rng).scale_output(0.0);
+        let policy = Mlp::dreamer(world.device(), features, &hidden, Some(2 * actions), rng).scale_output(0.01);
+        let critic = Mlp::dreamer(world.device(), features, &hidden, Some(world.bins().count()), rng).scale_output(0.0);
         // A copy with tensors of its own.
         let mut slow = critic.clone();
         copy_parameters(&mut slow, &critic);

@@ -1,0 +1,165 @@
+//! Single transitions in a ring buffer, drawn uniformly: what SAC and PETS learn from.
+
+use rand::RngExt;
+
+use crate::checkpoint::Weights;
+use crate::error::{Error, Result};
+use crate::rng::Rng;
+
+/// One step of experience. Observations and action may belong to any environment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Transition {
+    /// The observation before the step.
+    pub obs: Vec<f32>,
+    /// The action, as the agent chose it.
+    pub action: Vec<f32>,
+    /// The reward of the step.
+    pub reward: f32,
+    /// The observation after the step: at the end of an episode its last one, never the first of the
+    /// next episode.
+    pub next_obs: Vec<f32>,
+    /// The task itself ended. An end by the clock does not count: its future is valued from
+    /// `next_obs` like any other.
+    pub terminated: bool,
+    /// The clock ended the episode.
+    pub truncated: bool,
+}
+
+/// A transition as the buffer holds it.
+#[derive(Clone, Copy, Debug)]
+pub struct Row<'a> {
+    /// The observation before the step.
+    pub obs: &'a [f32],
+    /// The action.
+    pub action: &'a [f32],
+    /// The reward.
+    pub reward: f32,
+    /// The observation after the step.
+    pub next_obs: &'a [f32],
+    /// Whether the task ended.
+    pub terminated: bool,
+}
+
+/// A minibatch: `size` rows in each field, one after the other.
+#[derive(Clone, Debug, Default)]
+pub struct Batch {
+    /// Rows.
+    pub size: usize,
+    /// Observations, `[size, observation]`.
+    pub obs: Vec<f32>,
+    /// Actions, `[size, action]`.
+    pub actions: Vec<f32>,
+    /// Rewards, `[size]`.
+    pub rewards: Vec<f32>,
+    /// Observations after the step, `[size, observation]`.
+    pub next_obs: Vec<f32>,
+    /// 1 where the task ended, else 0, `[size]`.
+    pub terminated: Vec<f32>,
+}
+
+/// A ring of the last transitions.
+#[derive(Clone, Debug)]
+pub struct ReplayBuffer {
+    observation_size: usize,
+    action_size: usize,
+    capacity: usize,
+    /// Where the next transition goes.
+    next: usize,
+    /// One row a transition: obs, action, reward, next_obs, terminated.
+    rows: Vec<f32>,
+}
+
+impl ReplayBuffer {
+    /// A buffer for `capacity` transitions.
+    pub fn new(observation_size: usize, action_size: usize, capacity: usize) -> Self {
+        Self { observation_size, action_size, capacity: capacity.max(1), next: 0, rows: Vec::new() }
+    }
+
+    fn width(&self) -> usize {
+        2 * self.observation_size + self.action_size + 2
+    }
+
+    /// Transitions held.
+    pub fn len(&self) -> usize {
+        self.rows.len() / self.width()
+    }
+
+    /// Whether it holds none.
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Adds a transition; the oldest one makes room when the buffer is full.
+    ///
+    /// # Panics
+    /// If observation or action have the wrong length.
+    pub fn push(&mut self, t: &Transition) {
+        let (obs, action) = (self.observation_size, self.action_size);
+        assert!(t.obs.len() == obs && t.next_obs.len() == obs && t.action.len() == action, "sizes of this buffer");
+        let tail = [f32::from(t.terminated)];
+        let row = t.obs.iter().chain(&t.action).chain([&t.reward]).chain(&t.next_obs).chain(&tail);
+        if self.len() < self.capacity {
+            self.rows.extend(row);
+        } else {
+            let width = self.width();
+            let old = &mut self.rows[self.next * width..][..width];
+            old.iter_mut().zip(row).for_each(|(old, new)| *old = *new);
+        }
+        self.next = (self.next + 1) % self.capacity;
+    }
+
+    /// The `i`th transition in memory; once the buffer is full, that is not the order of time.
+    ///
+    /// # Panics
+    /// If there are not so many.
+    pub fn row(&self, i: usize) -> Row<'_> {
+        let width = self.width();
+        let (obs, rest) = self.rows[i * width..][..width].split_at(self.observation_size);
+        let (action, rest) = rest.split_at(self.action_size);
+        let (reward, next_obs, terminated) = (rest[0], &rest[1..=self.observation_size], rest[rest.len() - 1] > 0.5);
+        Row { obs, action, reward, next_obs, terminated }
+    }
+
+    /// Draws `size` transitions uniformly, with replacement.
+    ///
+    /// # Panics
+    /// If the buffer is empty.
+    pub fn sample(&self, size: usize, rng: &mut Rng) -> Batch {
+        assert!(!self.is_empty(), "something to draw from");
+        let mut batch = Batch { size, ..Batch::default() };
+        for _ in 0..size {
+            let row = self.row(rng.random_range(0..self.len()));
+            batch.obs.extend(row.obs);
+            batch.actions.extend(row.action);
+            batch.rewards.push(row.reward);
+            batch.next_obs.extend(row.next_obs);
+            batch.terminated.push(f32::from(row.terminated));
+        }
+        batch
+    }
+
+    /// Writes the buffer into `weights`, under `prefix`.
+    pub fn save(&self, weights: &mut Weights, prefix: &str) {
+        weights.insert(format!("{prefix}.rows"), self.rows.clone(), [1, self.len(), self.width()]);
+        weights.insert_counts(format!("{prefix}.next"), &[self.next as u64]);
+    }
+
+    /// Reads what [`ReplayBuffer::save`] wrote.
+    ///
+    /// # Errors
+    /// If it is missing, or of transitions of other sizes.
+    pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
+        let name = format!("{prefix}.rows");
+        let [_, count, _] = weights.shape(&name)?;
+        if count > self.capacity {
+            return Err(Error::BadSetting(format!(
+                "{count} saved transitions do not fit into a replay buffer of {}",
+                self.capacity
+            )));
+        }
+        let rows = weights.get(&name, [1, count, self.width()])?.to_vec();
+        self.next = weights.counts(&format!("{prefix}.next"), 1)?[0] as usize;
+        self.rows = rows;
+        Ok(())
+    }
+}
