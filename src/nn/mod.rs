@@ -20,6 +20,7 @@ pub mod tape;
 pub mod two_hot;
 
 pub use crate::checkpoint::Weights;
+pub(crate) use adam::adam_step;
 pub use adam::{Adam, AdamConfig};
 pub use categorical::Categorical;
 pub use dfdx;
