@@ -1,5 +1,5 @@
-//! What a gradient costs beside the roll-out that it belongs to: forward mode, the adjoint recursion, central differences, on
-//! the planar pusher, as the horizon grows. Two actions a step.
+//! The time of a gradient next to that of its roll-out: forward mode, reverse mode (adjoint method) and central differences, on
+//! the planar pusher, as the horizon grows. Two numbers in an action.
 
 use std::hint::black_box;
 

@@ -1,4 +1,4 @@
-//! Control steps per second of the worlds, on one core.
+//! Control steps per second of the environments, on one core.
 //!
 //! Random actions touch table and cube now and then; with the cube in the hand, every step is contact.
 
@@ -26,7 +26,7 @@ fn steps(c: &mut Criterion) {
     let mut group = c.benchmark_group("control steps");
     group.throughput(Throughput::Elements(STEPS as u64)).sample_size(20);
     for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack] {
-        // robosuite's own action, of seven numbers, for a comparison of like with like.
+        // robosuite's own action of seven numbers, so that the figures can be compared with robosuite's.
         let mut world = endless(task, ActionKind::Pose);
         world.reset(0);
         let actions = random_actions(7, 1000);

@@ -1,6 +1,7 @@
-//! Where gradients lie: across contact. The exact gradient of a push is set beside that of the push as it is on average, when
-//! the actions are shaken a little, for softer and stiffer contact and for shorter and longer pushes; and beside finite
-//! differences on rapier3d, where nothing is smooth. `data/contact.csv`, `data/contact-rapier.csv`, `data/contact.svg`.
+//! Where gradients mislead: through contact. Compares the exact gradient of a push's cost with the gradient of its expected cost
+//! under a little action noise (randomised smoothing), for softer and stiffer contact and for shorter and longer pushes; and
+//! with finite differences in rapier3d, whose contact is not smooth. `data/contact.csv`, `data/contact-rapier.csv`,
+//! `data/contact.svg`.
 //!
 //! `cargo run --example contact` (three minutes).
 
@@ -17,9 +18,9 @@ use rayon::prelude::*;
 
 const STIFFNESS: [f64; 5] = [50.0, 150.0, 500.0, 1500.0, 5000.0];
 const HORIZONS: [usize; 4] = [5, 10, 20, 40];
-/// Pushes tried for each pair of those.
+/// Pushes for each pair of stiffness and horizon.
 const PUSHES: usize = 16;
-/// Shaken copies of each push, and by how much each number of an action is shaken.
+/// Noisy copies of each push, and the standard deviation of the noise on each number of an action.
 const COPIES: usize = 200;
 const SHAKE: f64 = 0.1;
 
@@ -30,15 +31,15 @@ struct Row {
     horizon: usize,
     /// Norm of the exact gradient.
     exact: f64,
-    /// Norm of the gradient of the cost as it is on average.
+    /// Norm of the gradient of the expected cost.
     smoothed: f64,
-    /// Norm of their difference, as a share of the second.
+    /// Norm of their difference, relative to the second.
     bias: f64,
     /// Cosine of the angle between the two.
     cosine: f64,
-    /// Standard deviation of one shaken copy's exact gradient, as a share of the second.
+    /// Standard deviation of the first-order estimate (the exact gradient of one noisy copy), relative to the second.
     first_order_deviation: f64,
-    /// The same of one shaken copy's estimate from its cost alone.
+    /// The same of the zeroth-order estimate, from the cost of one noisy copy alone.
     zeroth_order_deviation: f64,
 }
 

@@ -1,5 +1,5 @@
-//! One push, recorded in the rapier3d world: how well does a simulator that is fitted to it foresee that push and others, and how
-//! well an ensemble? Both are given the hand's true way; what they have to foresee is the cube. `data/identify.csv`.
+//! System identification from one push, recorded in rapier3d: how well does a simulator that is fitted to it predict that push
+//! and others, and how well does an ensemble? Both are given the hand's true path and predict the cube. `data/identify.csv`.
 //!
 //! `cargo run --example identify` (a minute).
 
@@ -13,19 +13,19 @@ use handful::replay::{ReplayBuffer, Transition};
 use handful::rng;
 use handful::study::statistics::mean;
 
-/// Pushes that are recorded; each in turn is the one that is learned from, the others are foreseen.
+/// Recorded pushes; each in turn is the one that is learned from, and the others are predicted.
 const PUSHES: usize = 8;
 /// How far a push must have moved the cube, m.
 const FAR: f64 = 0.05;
-/// Where the cube's position stands in an observation, and the direction of its first axis.
+/// Indices in an observation: the cube's position, and the direction of its x-axis.
 const CUBE: usize = 6;
 const AXIS: usize = 9;
-/// What is known beforehand: the hand's two fingers, which are rough. Mass and friction are guesses (the truth is 0.064 kg and 0.5).
+/// The prior: the hand's two fingers are known, and rough; mass and friction are guesses (the truth is 0.064 kg and 0.5).
 const GUESS: Pusher<f64> = Pusher { mass: 0.1, friction: 0.3, grip: 1.0, stiffness: 2000.0, spread: 0.0095 };
 /// Half the cube's edge, m: how far a radian moves the middle of an edge.
 const HALF: f64 = 0.02;
 
-/// A push from the moment when the hand is down and near.
+/// A push from the time step on at which the hand is down and near the cube.
 struct Push {
     observations: Vec<Vec<f32>>,
     actions: Vec<Vec<f32>>,
@@ -68,25 +68,25 @@ impl Push {
         }
     }
 
-    /// How far the cube was moved, m.
+    /// Distance that the cube moved, m.
     fn moved(&self) -> f64 {
         let [first, last] = [&self.observations[0], &self.observations[self.actions.len()]].map(|obs| pose(obs));
         (last[0] - first[0]).hypot(last[1] - first[1])
     }
 
-    /// Root mean square distance of foreseen poses from those that were seen, m.
-    fn error(&self, foreseen: &[[f64; 3]]) -> f64 {
+    /// Root-mean-square error of predicted poses, m.
+    fn error(&self, predicted: &[[f64; 3]]) -> f64 {
         let square = |(a, b): (&[f64; 3], [f64; 3])| {
             let turn = (a[2] - b[2] + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
             (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2) + (HALF * turn).powi(2)
         };
         let squares: Vec<f64> =
-            foreseen.iter().zip(self.observations.iter().map(|obs| pose(obs))).skip(1).map(square).collect();
+            predicted.iter().zip(self.observations.iter().map(|obs| pose(obs))).skip(1).map(square).collect();
         mean(&squares).sqrt()
     }
 
-    /// What an ensemble foresees.
-    fn foreseen_by(&self, ensemble: &Ensemble, layout: &FeatureMap) -> Vec<[f64; 3]> {
+    /// The poses that an ensemble predicts, open loop but for the hand.
+    fn predicted_by(&self, ensemble: &Ensemble, layout: &FeatureMap) -> Vec<[f64; 3]> {
         let dynamics = ensemble.dynamics();
         let mut obs = self.observations[0].clone();
         let mut poses = vec![pose(&obs)];
@@ -112,10 +112,10 @@ fn pose(obs: &[f32]) -> [f64; 3] {
 struct Row {
     learned_from: usize,
     model: &'static str,
-    /// Root mean square error, m: on the push itself, and the mean over the others.
+    /// Root-mean-square error, m: on the push itself, and the mean over the others.
     same: f64,
     others: f64,
-    /// What was found, kg and 1, and the standard deviations of their logarithms.
+    /// Estimates, kg and dimensionless, and the standard deviations of their logarithms.
     mass: Option<f64>,
     friction: Option<f64>,
     mass_deviation: Option<f64>,
@@ -167,7 +167,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             });
         }
         ensemble.fit(&data, &mut rng);
-        let error = |push: &Push| push.error(&push.foreseen_by(&ensemble, &layout));
+        let error = |push: &Push| push.error(&push.predicted_by(&ensemble, &layout));
         let nothing = |push: &Push| push.error(&vec![pose(&push.observations[0]); push.observations.len()]);
         let (mass, friction, mass_deviation, friction_deviation) = (None, None, None, None);
         for (model, error) in [("ensemble", &error as &dyn Fn(&Push) -> f64), ("nothing moves", &nothing)] {

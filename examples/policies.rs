@@ -1,5 +1,5 @@
-//! Two ways to a policy: SAC, which only sees rewards, and gradients through the simulator itself. Both learn to swing up the
-//! pendulum; returns over simulated steps and over seconds: `data/policies.csv`, `data/policies.svg`.
+//! Two ways to a policy: SAC, which only sees rewards, and analytic policy gradients, through the simulator itself. Both learn to
+//! swing up the pendulum; returns over simulated steps and over seconds: `data/policies.csv`, `data/policies.svg`.
 //!
 //! `cargo run --example policies` (three minutes).
 
@@ -24,15 +24,15 @@ struct Row {
     seed: u64,
     /// Simulated steps so far.
     steps: usize,
-    /// Seconds of learning so far, judging left out.
+    /// Seconds of training so far, without evaluation.
     seconds: f64,
     /// Mean return of 20 episodes.
     #[serde(rename = "return")]
     total: f64,
 }
 
-/// The mean return of what chooses actions, in the environment.
-fn judge(mut act: impl FnMut(&[f32]) -> f32) -> Result<f64, Box<dyn Error>> {
+/// The mean return of a policy in the environment.
+fn evaluate(mut act: impl FnMut(&[f32]) -> f32) -> Result<f64, Box<dyn Error>> {
     let mut world = Pendulum::default();
     let mut total = 0.0;
     for episode in 0..EPISODES {
@@ -60,7 +60,7 @@ fn by_gradients(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
             search.update(&PendulumSwing, &mut rng);
         }
         spent += clock.elapsed();
-        let total = judge(|obs| search.act(&SVector::from_column_slice(obs))[0])?;
+        let total = evaluate(|obs| search.act(&SVector::from_column_slice(obs))[0])?;
         rows.push(Row { method: "gradients", seed, steps: search.steps, seconds: spent.as_secs_f64(), total });
     }
     Ok(())
@@ -93,7 +93,7 @@ fn by_sac(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
         agent.update();
         spent += clock.elapsed();
         if steps.is_multiple_of(500) {
-            let total = judge(|obs| agent.act(obs, Mode::Evaluate)[0])?;
+            let total = evaluate(|obs| agent.act(obs, Mode::Evaluate)[0])?;
             rows.push(Row { method: "sac", seed, steps, seconds: spent.as_secs_f64(), total });
         }
     }

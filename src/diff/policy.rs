@@ -69,6 +69,7 @@ impl Default for AnalyticPolicyGradientConfig {
 #[doc(alias = "SHAC")]
 #[doc(alias = "short-horizon actor-critic")]
 #[doc(alias = "backpropagation through time")]
+#[derive(Debug)]
 pub struct AnalyticPolicyGradient<const N: usize, const M: usize, const O: usize> {
     config: AnalyticPolicyGradientConfig,
     policy: Mlp,

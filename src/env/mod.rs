@@ -108,6 +108,8 @@ impl Step {
 ///
 /// `Box<dyn Env>` is an environment too, so that code generic over `E: Env` also takes one that is chosen at run time;
 /// `<dyn Env>::downcast_ref` gets the concrete type back.
+#[doc(alias = "Gymnasium")]
+#[doc(alias = "gym")]
 pub trait Env: std::any::Any + Send {
     /// The names, sizes and units of observations and actions. It does not change.
     fn spec(&self) -> &Spec;
@@ -119,7 +121,7 @@ pub trait Env: std::any::Any + Send {
     /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.
     ///
     /// # Errors
-    /// [`Error::BadAction`] if the action has the wrong length or is not finite; nothing has moved then.
+    /// [`crate::error::Error::BadAction`] if the action has the wrong length or is not finite; nothing has moved then.
     fn step(&mut self, action: &[f32]) -> Result<Step>;
 
     /// Position (m) of the tracked point, a robot's hand for example; the smoothness of motion is measured there. None

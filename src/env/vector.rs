@@ -19,6 +19,8 @@ use super::{Env, Step};
 use crate::error::{Error, Result};
 
 /// Environments of one kind, side by side; the contract of each is enforced ([`Checked`]).
+#[doc(alias = "vectorized environment")]
+#[doc(alias = "batched environment")]
 #[derive(Clone, Debug)]
 pub struct VectorEnv<E> {
     envs: Vec<Checked<E>>,

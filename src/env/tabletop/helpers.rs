@@ -10,10 +10,10 @@
 //! let features: Vec<_> = cube_features("cube").chain(difference_features("hand", "cube")).collect();
 //! assert_eq!((features.len(), features[0].name.as_str()), (15, "cube x"));
 //!
-//! // 10 cm to the left of a goal: reward 0.24, and full speed to the right.
-//! let way = vector_at(&[0.0, 0.0, 0.1, 0.0], 1);
-//! assert!((reaching_reward(way.norm()) - 0.24).abs() < 0.01);
-//! assert_eq!(action_towards(way, 0.0), [0.0, 1.5, 0.0, 0.0]);
+//! // 12.5 cm from a goal: full speed towards it.
+//! let way = vector_at(&[0.0, 0.0, 0.125, 0.0], 1);
+//! assert_eq!(action_towards(way, 0.0), [0.0, 1.875, 0.0, 0.0]);
+//! assert!((reaching_reward(0.1) - 0.24).abs() < 0.01);
 //! ```
 
 use std::ops::Range;

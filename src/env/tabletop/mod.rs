@@ -137,8 +137,8 @@ impl Tabletop {
     /// [`Tabletop::scripted_action`] has nothing to say; an observation without a scripted action is answered with zeros.
     pub fn scripted_policy(&self) -> Option<impl Fn(&[f32]) -> Vec<f32> + Send + Sync + use<>> {
         let (task, options) = (self.task.clone(), self.options);
-        (self.scripted && self.observes_compact())
-            .then(|| move |obs: &[f32]| options.action_of_hand(task.scripted(obs).unwrap_or_default()))
+        let policy = move |obs: &[f32]| options.action_of_hand(task.scripted(obs).unwrap_or_default());
+        (self.scripted && self.observes_compact()).then_some(policy)
     }
 
     fn observes_compact(&self) -> bool {
