@@ -111,7 +111,7 @@ impl Chart {
         let x = span(shown().map(|(x, _)| *x), self.x_log);
         let y = self.y_range.map(|[low, high]| (low, high)).or_else(|| span(shown().map(|(_, y)| *y), self.y_log));
         let (Some((x0, x1)), Some((y0, y1))) = (x, y) else {
-            return Err(Error::BadSetting("chart: nothing in it can be drawn".into()));
+            return Err(Error::Config("chart: nothing in it can be drawn".into()));
         };
         let mut svg = String::new();
         let drawn = match (self.x_log, self.y_log) {
@@ -120,7 +120,7 @@ impl Chart {
             (false, true) => self.draw(&mut svg, x0..x1, (y0..y1).log_scale()),
             (true, true) => self.draw(&mut svg, (x0..x1).log_scale(), (y0..y1).log_scale()),
         };
-        drawn.map_err(|error| Error::BadSetting(format!("chart: {error}")))?;
+        drawn.map_err(|error| Error::Config(format!("chart: {error}")))?;
         Ok(svg)
     }
 

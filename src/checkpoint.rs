@@ -58,9 +58,9 @@ impl Weights {
     /// If it is missing or has another shape.
     pub fn get(&self, name: &str, shape: [usize; 3]) -> Result<&[f32]> {
         match self.arrays.get(name) {
-            None => Err(Error::BadSetting(format!("the weights have no `{name}`"))),
+            None => Err(Error::Config(format!("the weights have no `{name}`"))),
             Some((_, other)) if *other != shape => {
-                Err(Error::BadSetting(format!("`{name}` has the sizes {other:?} where {shape:?} are expected")))
+                Err(Error::Config(format!("`{name}` has the sizes {other:?} where {shape:?} are expected")))
             }
             Some((numbers, _)) => Ok(numbers),
         }
@@ -72,7 +72,7 @@ impl Weights {
     /// If there is none of that name.
     pub fn shape(&self, name: &str) -> Result<[usize; 3]> {
         let found = self.arrays.get(name).map(|(_, shape)| *shape);
-        found.ok_or_else(|| Error::BadSetting(format!("the weights have no `{name}`")))
+        found.ok_or_else(|| Error::Config(format!("the weights have no `{name}`")))
     }
 
     /// Adds whole numbers, stored as a U64 tensor.
@@ -88,10 +88,9 @@ impl Weights {
     pub fn counts(&self, name: &str, count: usize) -> Result<Vec<u64>> {
         match self.counts.get(name) {
             Some(counts) if counts.len() == count => Ok(counts.clone()),
-            Some(counts) => Err(Error::BadSetting(format!(
-                "`{name}` holds {} whole numbers where {count} are expected",
-                counts.len()
-            ))),
+            Some(counts) => {
+                Err(Error::Config(format!("`{name}` holds {} whole numbers where {count} are expected", counts.len())))
+            }
             None => {
                 let parts = self.get(name, [1, count, 4])?;
                 let joined = parts.chunks(4).map(|p| (0..4).map(|i| (p[i] as u64) << (16 * i)).sum());
@@ -139,7 +138,9 @@ impl Weights {
             (name, view.expect("one number each"))
         });
         let bytes = safetensors::serialize(arrays.chain(counts), Some(self.notes.clone().into_iter().collect()))
-            .map_err(|problem| Error::bad_file(path, format!("cannot be composed: {problem}")))?;
+            .map_err(|problem| {
+                Error::checkpoint(path, format!("cannot be composed: {problem}"), Some(problem.into()))
+            })?;
         files::write(path, &bytes)
     }
 
@@ -149,13 +150,12 @@ impl Weights {
     /// If it cannot be read, is damaged, or holds anything but f32 arrays of three dimensions and u64 arrays of one.
     pub fn read(path: &Path) -> Result<Self> {
         let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
-        let file = SafeTensors::deserialize(&bytes).map_err(|problem| {
-            Error::bad_file(
-                path,
-                format!("damaged, or no safetensors file ({problem}); restore it or start the run anew"),
-            )
-        })?;
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|problem| Error::bad_file(path, problem))?;
+        let damaged = |problem: safetensors::SafeTensorError| {
+            let advice = format!("damaged, or no safetensors file ({problem}); restore it or start the run anew");
+            Error::checkpoint(path, advice, Some(problem.into()))
+        };
+        let file = SafeTensors::deserialize(&bytes).map_err(damaged)?;
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
         let notes = header.metadata().clone().unwrap_or_default().into_iter().collect();
         let mut weights = Self { notes, ..Self::default() };
         for (name, view) in file.tensors() {
@@ -167,10 +167,8 @@ impl Weights {
                     weights.counts.insert(name, bytemuck::pod_collect_to_vec(view.data()));
                 }
                 _ => {
-                    return Err(Error::bad_file(
-                        path,
-                        format!("`{name}` is not one of our arrays; is this file from another program?"),
-                    ));
+                    let advice = format!("`{name}` is not one of our arrays; is this file from another program?");
+                    return Err(Error::checkpoint(path, advice, None));
                 }
             }
         }

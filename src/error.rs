@@ -5,8 +5,12 @@ use std::path::{Path, PathBuf};
 /// The crate's result.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
+/// What another library said.
+pub type Cause = Box<dyn std::error::Error + Send + Sync>;
+
 /// An error that says what was wrong, where, and what to do.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum Error {
     /// A name that is not one of the known ones.
     #[error("unknown {what} `{name}`{}; known: {}", hint(.closest), .known.join(", "))]
@@ -21,10 +25,10 @@ pub enum Error {
         known: Vec<String>,
     },
     /// An action that an environment cannot take.
-    #[error("{task}: {problem}")]
-    BadAction {
+    #[error("{env}: {problem}")]
+    Action {
         /// The environment.
-        task: String,
+        env: String,
         /// What is wrong with the action.
         problem: String,
     },
@@ -36,24 +40,38 @@ pub enum Error {
         /// The rule that was broken, and at which step of the episode.
         rule: String,
     },
-    /// A setting with an unusable value.
+    /// A setting with an unusable value, or settings that do not fit together.
     #[error("{0}")]
-    BadSetting(String),
+    Config(String),
     /// A configuration file or preset that cannot be read.
     #[error("{}: {problem}", .path.display())]
-    BadConfig {
+    ConfigFile {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         problem: String,
+        /// What the parser said.
+        source: Box<toml::de::Error>,
     },
-    /// A file of ours that is damaged, or not ours.
+    /// Weights or a checkpoint that are damaged, or of another run.
     #[error("{}: {problem}", .path.display())]
-    BadFile {
+    Checkpoint {
         /// The file.
         path: PathBuf,
         /// What is wrong with it, and what to do.
         problem: String,
+        /// What caused it, if another library found it.
+        source: Option<Cause>,
+    },
+    /// A table or a figure that cannot be read or made.
+    #[error("{}: {problem}", .path.display())]
+    Data {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+        /// What caused it, if another library found it.
+        source: Option<Cause>,
     },
     /// The operating system said no.
     #[error("cannot {doing} {}: {source}", .path.display())]
@@ -82,13 +100,22 @@ impl Error {
     }
 
     /// An action that does not fit.
-    pub fn bad_action(task: &str, problem: impl Into<String>) -> Self {
-        Self::BadAction { task: task.into(), problem: problem.into() }
+    pub fn action(env: &str, problem: impl Into<String>) -> Self {
+        Self::Action { env: env.into(), problem: problem.into() }
     }
 
-    /// A damaged or foreign file.
-    pub fn bad_file(path: &Path, problem: impl std::fmt::Display) -> Self {
-        Self::BadFile { path: path.into(), problem: problem.to_string() }
+    /// A checkpoint that cannot be used.
+    pub fn checkpoint(path: &Path, problem: impl Into<String>, source: Option<Cause>) -> Self {
+        Self::Checkpoint { path: path.into(), problem: problem.into(), source }
+    }
+
+    /// For `map_err`: a table or figure that cannot be read or made, for the cause that another library tells.
+    pub fn data<C: Into<Cause>>(path: &Path) -> impl FnOnce(C) -> Self {
+        let path = path.to_path_buf();
+        move |cause| {
+            let cause = cause.into();
+            Self::Data { path, problem: cause.to_string(), source: Some(cause) }
+        }
     }
 
     /// For `map_err`: a failed read, write or the like of `path`.

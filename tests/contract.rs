@@ -121,7 +121,7 @@ fn a_refused_action_does_not_count_as_a_step() {
     let mut env = env([good(), good(), good().truncated(true)]);
     env.reset(0).expect("in order");
     for _ in 0..3 {
-        assert!(matches!(env.step(&[0.0, 0.0]), Err(Error::BadAction { .. })));
+        assert!(matches!(env.step(&[0.0, 0.0]), Err(Error::Action { .. })));
         env.step(&[0.0]).expect("in order");
     }
 }
@@ -167,13 +167,13 @@ fn a_spec_that_makes_no_sense_is_refused() {
         (Spec::new("mine", [x()], 1, 10, f64::NAN), "mine: `dt` must be positive and finite, it is NaN"),
     ] {
         let error = spec.check().expect_err(expected);
-        assert!(matches!(error, Error::BadSetting(_)));
+        assert!(matches!(error, Error::Config(_)));
         assert_eq!(error.to_string(), expected);
     }
     with(vec![x(), y(), difference("x", "y")]).check().expect("this one makes sense");
     let mut unusable = env([good()]);
     unusable.env_mut().spec.horizon = 0;
-    assert!(matches!(unusable.reset(0), Err(Error::BadSetting(_))));
+    assert!(matches!(unusable.reset(0), Err(Error::Config(_))));
 }
 
 #[test]

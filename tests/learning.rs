@@ -381,7 +381,7 @@ fn a_damaged_checkpoint_is_named_and_kept() {
     let whole = std::fs::read(&checkpoint).expect("a checkpoint");
     std::fs::write(&checkpoint, &whole[..whole.len() / 2]).expect("a writable folder");
     let Err(problem) = open(&debug_run(5), folder.path()) else { panic!("half a checkpoint is none") };
-    assert!(matches!(problem, Error::BadFile { .. }), "{problem}");
+    assert!(matches!(problem, Error::Checkpoint { .. }), "{problem}");
     assert!(problem.to_string().contains("state.safetensors"), "{problem}");
     assert_eq!(std::fs::read(&checkpoint).expect("still there").len(), whole.len() / 2);
 }

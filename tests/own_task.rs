@@ -173,7 +173,7 @@ fn what_does_not_fit_together_is_refused_when_it_is_made() {
         (Touch::new(0.025), never, "touch 50 mm: `horizon` must be at least 1"),
     ] {
         let error = Tabletop::new(task, options).expect_err(expected);
-        assert!(matches!(error, Error::BadSetting(_)));
+        assert!(matches!(error, Error::Config(_)));
         assert_eq!(error.to_string(), expected);
     }
 }

@@ -232,7 +232,7 @@ fn options_change_what_they_say() {
         assert_eq!((env.reset(0).len(), env.spec().action_size), (objects + 50, 7));
         assert_eq!(env.spec().observation_size(), objects + 50);
     }
-    assert!(matches!(Task::Pendulum.make_with(sparse), Err(Error::BadSetting(_))));
+    assert!(matches!(Task::Pendulum.make_with(sparse), Err(Error::Config(_))));
 }
 
 #[test]
@@ -245,9 +245,9 @@ fn bad_actions_are_refused_and_change_nothing() {
         let mut with = vec![0.0; size];
         for bad in [f32::NAN, f32::INFINITY] {
             with[size - 1] = bad;
-            assert!(matches!(env.step(&with), Err(Error::BadAction { .. })));
+            assert!(matches!(env.step(&with), Err(Error::Action { .. })));
         }
-        assert!(matches!(env.step(&vec![0.0; size + 1]), Err(Error::BadAction { .. })));
+        assert!(matches!(env.step(&vec![0.0; size + 1]), Err(Error::Action { .. })));
         let good = vec![0.5; size];
         assert_eq!(bits(&env.step(&good).expect("valid")), bits(&untouched.step(&good).expect("valid")), "{task}");
     }

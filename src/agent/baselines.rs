@@ -38,10 +38,10 @@ impl Scripted {
     /// If the task has none, or observations are not compact.
     pub fn of_task(task: Task, options: TableOptions) -> Result<Self> {
         if options.observation != ObservationKind::Compact {
-            return Err(Error::BadSetting("the scripted policies need compact observations".into()));
+            return Err(Error::Config("the scripted policies need compact observations".into()));
         }
         let policy = task.scripted_policy(options);
-        policy.map(Self::new).ok_or_else(|| Error::BadSetting(format!("{task} has no scripted policy")))
+        policy.map(Self::new).ok_or_else(|| Error::Config(format!("{task} has no scripted policy")))
     }
 }
 

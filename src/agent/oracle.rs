@@ -144,7 +144,7 @@ impl<E: Env + Snapshot> Policy for Oracle<E> {
         let plan = |slot: &Slot| {
             let env = slot.env.downcast_ref::<E>().ok_or_else(|| {
                 let wanted = &self.simulators[0].spec().name;
-                Error::BadSetting(format!("an oracle for `{wanted}` cannot plan in `{}`", slot.env.spec().name))
+                Error::Config(format!("an oracle for `{wanted}` cannot plan in `{}`", slot.env.spec().name))
             })?;
             if slot.first {
                 self.begin_episode(slot.index);

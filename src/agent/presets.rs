@@ -55,13 +55,10 @@ pub trait Preset: DeserializeOwned + Default {
     fn preset_for(method: &str, task: &str) -> Result<Self> {
         let mut table = preset_table(&PRESETS, task, method)?;
         if table.get("agent").and_then(Value::as_str) != Some(Self::TABLE) {
-            return Err(Error::BadSetting(format!(
-                "the method `{method}` has no settings of the kind `{}`",
-                Self::TABLE
-            )));
+            return Err(Error::Config(format!("the method `{method}` has no settings of the kind `{}`", Self::TABLE)));
         }
         let settings = table.remove(Self::TABLE).unwrap_or_else(|| Value::Table(Table::new()));
-        settings.try_into().map_err(|problem: toml::de::Error| Error::BadSetting(problem.message().into()))
+        settings.try_into().map_err(|problem: toml::de::Error| Error::Config(problem.message().into()))
     }
 }
 
@@ -87,7 +84,7 @@ pub(crate) fn preset_table(presets: &[(impl AsRef<str>, impl AsRef<str>)], task:
     let (_, text) =
         found.ok_or_else(|| Error::unknown("method", method, presets.iter().map(|(name, _)| name.as_ref())))?;
     let mut table: Table = toml::from_str(text.as_ref())
-        .map_err(|problem| Error::BadSetting(format!("the preset `{method}`: {}", problem.message())))?;
+        .map_err(|problem| Error::Config(format!("the preset `{method}`: {}", problem.message())))?;
     specialise(&mut table, task);
     let Some(Value::String(base)) = table.remove("base") else { return Ok(table) };
     let mut whole = preset_table(presets, task, &base)?;

@@ -77,5 +77,5 @@ fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> Result<()> {
         }
         eprintln!("\nfinishing the episodes that have begun and saving; press Ctrl-C again to quit at once");
     })
-    .map_err(|problem| Error::BadSetting(format!("cannot watch for Ctrl-C: {problem}")))
+    .map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))
 }

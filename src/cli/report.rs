@@ -27,5 +27,5 @@ pub(super) fn write(from: &Path, to: &Path) -> Result<()> {
 
 #[cfg(not(feature = "study"))]
 pub(super) fn write(_from: &Path, _to: &Path) -> Result<()> {
-    Err(crate::error::Error::BadSetting("reports need the feature `study`: cargo run --features study".into()))
+    Err(crate::error::Error::Config("reports need the feature `study`: cargo run --features study".into()))
 }

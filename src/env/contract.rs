@@ -63,7 +63,7 @@ impl<E: Env> Checked<E> {
     /// [`Env::reset`].
     ///
     /// # Errors
-    /// [`Error::BadSetting`] if the spec makes no sense, [`Error::Contract`] if the first observation breaks a rule.
+    /// [`Error::Config`] if the spec makes no sense, [`Error::Contract`] if the first observation breaks a rule.
     pub fn reset(&mut self, seed: u64) -> Result<Vec<f32>> {
         self.elapsed = None;
         self.env.spec().check()?;

@@ -121,7 +121,7 @@ pub trait Env: std::any::Any + Send {
     /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.
     ///
     /// # Errors
-    /// [`crate::error::Error::BadAction`] if the action has the wrong length or is not finite; nothing has moved then.
+    /// [`crate::error::Error::Action`] if the action has the wrong length or is not finite; nothing has moved then.
     fn step(&mut self, action: &[f32]) -> Result<Step>;
 
     /// Position (m) of the tracked point, a robot's hand for example; the smoothness of motion is measured there. None

@@ -122,11 +122,11 @@ impl Spec {
     /// Checks that the specification makes sense. Agents call it before anything else.
     ///
     /// # Errors
-    /// [`Error::BadSetting`] names the environment, the feature and the rule: at least one feature, one number in the
+    /// [`Error::Config`] names the environment, the feature and the rule: at least one feature, one number in the
     /// action and one step in the horizon; `dt` positive and finite; names neither empty nor given twice; centres finite,
     /// scales positive and finite; a [`Role::Difference`] names two features that are no differences themselves.
     pub fn check(&self) -> Result<()> {
-        let refuse = |problem: String| Err(Error::BadSetting(format!("{}: {problem}", self.name)));
+        let refuse = |problem: String| Err(Error::Config(format!("{}: {problem}", self.name)));
         if self.observation.is_empty() {
             return refuse("an observation needs at least one feature".into());
         }
@@ -178,16 +178,16 @@ impl Spec {
     /// Whether `action` can be taken: the right length, and every number finite.
     ///
     /// # Errors
-    /// [`Error::BadAction`] names the length or the number that is wrong.
+    /// [`Error::Action`] names the length or the number that is wrong.
     pub fn check_action(&self, action: &[f32]) -> Result<()> {
         if action.len() != self.action_size {
-            return Err(Error::bad_action(
+            return Err(Error::action(
                 &self.name,
                 format!("an action has {} numbers, this one has {}", self.action_size, action.len()),
             ));
         }
         match action.iter().position(|a| !a.is_finite()) {
-            Some(i) => Err(Error::bad_action(&self.name, format!("action[{i}] is {}", action[i]))),
+            Some(i) => Err(Error::action(&self.name, format!("action[{i}] is {}", action[i]))),
             None => Ok(()),
         }
     }

@@ -58,12 +58,12 @@ impl<E: Env> VectorEnv<E> {
     /// Starts an episode in each of the first `seeds.len()` environments; returns their first observations.
     ///
     /// # Errors
-    /// [`Error::BadSetting`] if there are more seeds than environments; the first environment's error if its spec or its
+    /// [`Error::Config`] if there are more seeds than environments; the first environment's error if its spec or its
     /// observation breaks the contract.
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Vec<f32>>> {
         if seeds.len() > self.envs.len() {
             let (seeds, envs) = (seeds.len(), self.envs.len());
-            return Err(Error::BadSetting(format!("reset: {seeds} seeds for {envs} environments")));
+            return Err(Error::Config(format!("reset: {seeds} seeds for {envs} environments")));
         }
         let each: Vec<_> = self.envs.par_iter_mut().zip(seeds).map(|(env, &seed)| env.reset(seed)).collect();
         each.into_iter().collect()
@@ -73,12 +73,12 @@ impl<E: Env> VectorEnv<E> {
     /// number of threads.
     ///
     /// # Errors
-    /// [`Error::BadSetting`] if `actions` has not one entry for each environment; else the error of the first
+    /// [`Error::Config`] if `actions` has not one entry for each environment; else the error of the first
     /// environment that refuses its action or breaks the contract. The others have moved then.
     pub fn step(&mut self, actions: &[Option<Vec<f32>>]) -> Result<Vec<Option<Step>>> {
         if actions.len() != self.envs.len() {
             let (actions, envs) = (actions.len(), self.envs.len());
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "step: {actions} actions for {envs} environments; give `None` to those that rest"
             )));
         }

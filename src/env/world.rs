@@ -72,14 +72,14 @@ impl Task {
     /// An environment for the task.
     ///
     /// # Errors
-    /// [`Error::BadSetting`] if pendulum or cart-pole are given options, which only arm tasks have, or if the options do not
+    /// [`Error::Config`] if pendulum or cart-pole are given options, which only arm tasks have, or if the options do not
     /// make sense.
     pub fn make_with(self, options: TableOptions) -> Result<World> {
         if let Some(task) = self.at_table() {
             return Ok(Tabletop::with_shared(task, options)?.into());
         }
         if options != TableOptions::default() {
-            return Err(Error::BadSetting(format!("{} has no options; those are for the arm's tasks", self.name())));
+            return Err(Error::Config(format!("{} has no options; those are for the arm's tasks", self.name())));
         }
         Ok(match self {
             Task::Pendulum => World::Pendulum(Pendulum::default()),

@@ -69,13 +69,13 @@ impl RssmConfig {
     /// If the sizes do not fit together.
     pub(crate) fn check(&self) -> Result<()> {
         if self.blocks == 0 || !self.deter.is_multiple_of(self.blocks) || self.deter == 0 {
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "rssm: `deter` ({}) must be a multiple of `blocks` ({})",
                 self.deter, self.blocks
             )));
         }
         if self.hidden == 0 || self.stoch == 0 || self.classes < 2 || !(0.0..1.0).contains(&self.unimix) {
-            return Err(Error::BadSetting(
+            return Err(Error::Config(
                 "rssm: `hidden` and `stoch` must be at least 1, `classes` at least 2, `unimix` in [0, 1)".into(),
             ));
         }

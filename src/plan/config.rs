@@ -71,12 +71,10 @@ impl PlannerConfig {
             PlannerConfig::Hybrid(HybridConfig { icem, .. }) => icem.population.min(icem.elites).min(icem.iterations),
         };
         if self.horizon() < 2 {
-            return Err(Error::BadSetting("planner: `horizon` must be at least 2".into()));
+            return Err(Error::Config("planner: `horizon` must be at least 2".into()));
         }
         if candidates == 0 {
-            return Err(Error::BadSetting(
-                "planner: population, elites, iterations, starts: at least 1 of each".into(),
-            ));
+            return Err(Error::Config("planner: population, elites, iterations, starts: at least 1 of each".into()));
         }
         Ok(())
     }

@@ -33,7 +33,7 @@ impl ControlConfig {
     pub(crate) fn check(&self, planner: &PlannerConfig) -> Result<()> {
         planner.check()?;
         if self.action_repeat == 0 || self.replan_every == 0 || self.replan_every > planner.horizon() {
-            return Err(Error::BadSetting(
+            return Err(Error::Config(
                 "control: `action_repeat` and `replan_every` must be at least 1, and `replan_every` no longer than the \
                  horizon"
                     .into(),

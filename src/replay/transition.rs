@@ -152,7 +152,7 @@ impl ReplayBuffer {
         let name = format!("{prefix}.rows");
         let [_, count, _] = weights.shape(&name)?;
         if count > self.capacity {
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "{count} saved transitions do not fit into a replay buffer of {}",
                 self.capacity
             )));

@@ -102,11 +102,11 @@ impl RunConfig {
             ("test_episodes", self.test_episodes),
         ] {
             if value == 0 {
-                return Err(Error::BadSetting(format!("`{name}` must be at least 1")));
+                return Err(Error::Config(format!("`{name}` must be at least 1")));
             }
         }
         if self.env.get("horizon").and_then(Value::as_integer) == Some(0) {
-            return Err(Error::BadSetting("`env.horizon` must be at least 1".into()));
+            return Err(Error::Config("`env.horizon` must be at least 1".into()));
         }
         Ok(())
     }
@@ -122,7 +122,7 @@ impl RunConfig {
     /// If the agent's settings are of another type.
     pub fn settings<C: DeserializeOwned>(&self) -> Result<C> {
         let settings = self.settings.clone().try_into();
-        settings.map_err(|problem: toml::de::Error| Error::BadSetting(problem.message().into()))
+        settings.map_err(|problem: toml::de::Error| Error::Config(problem.message().into()))
     }
 
     /// The same run with other settings of the agent.
@@ -183,12 +183,12 @@ fn upgrade_table(name: &str, table: &mut Table) {
 }
 
 /// One line of what is wrong with a configuration; for an unknown field, with the closest known one.
-pub(crate) fn bad_config(path: &Path, problem: &toml::de::Error) -> Error {
-    let message = problem.message();
+pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
+    let message = source.message();
     let mut names = message.split('`').skip(1).step_by(2);
     let problem = match (message.starts_with("unknown field"), names.next()) {
         (true, Some(field)) => Error::unknown("field", field, names).to_string(),
         _ => message.trim_end().to_string(),
     };
-    Error::BadConfig { path: path.into(), problem }
+    Error::ConfigFile { path: path.into(), problem, source: Box::new(source.clone()) }
 }

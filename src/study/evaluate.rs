@@ -157,7 +157,7 @@ impl<E: Env> Evaluator<E> {
         seeds: EvalSeeds,
     ) -> Result<bool> {
         if episodes == 0 {
-            return Err(Error::BadSetting("an evaluation needs at least one episode".into()));
+            return Err(Error::Config("an evaluation needs at least one episode".into()));
         }
         let done = evaluation.results.len();
         let seeds: Vec<u64> = (done..episodes.min(done + ENVS)).map(|i| seeds.seed(i)).collect();

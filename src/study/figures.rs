@@ -355,6 +355,6 @@ fn draw(path: &Path, paint: impl FnOnce(Area) -> Drawn) -> Result<()> {
     let mut svg = String::new();
     let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
     let painted = area.fill(&WHITE).map_err(Into::into).and_then(|()| paint(area));
-    painted.map_err(|problem| Error::bad_file(path, format!("cannot be drawn: {problem}")))?;
+    painted.map_err(|problem| Error::data(path)(format!("cannot be drawn: {problem}")))?;
     files::write(path, svg.as_bytes())
 }

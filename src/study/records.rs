@@ -184,7 +184,7 @@ fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<It
     let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
     let composed =
         writer.write_record(columns).and_then(|()| rows.into_iter().try_for_each(|row| writer.serialize(row)));
-    composed.map_err(|problem| Error::bad_file(path, problem))?;
-    let bytes = writer.into_inner().map_err(|problem| Error::bad_file(path, problem))?;
+    composed.map_err(Error::data(path))?;
+    let bytes = writer.into_inner().map_err(|problem| Error::data(path)(problem.to_string()))?;
     files::write(path, &bytes)
 }

@@ -71,10 +71,10 @@ impl<E: Env> Run<E> {
         if config_path.exists() {
             let there = RunConfig::read(&config_path)?;
             if let Some(difference) = difference(&there, &config) {
-                return Err(Error::bad_file(
-                    &config_path,
-                    format!("this folder holds another run ({difference}); choose another --out, or remove it"),
-                ));
+                return Err(Error::Config(format!(
+                    "{}: this folder holds another run ({difference}); choose another --out, or remove it",
+                    config_path.display()
+                )));
             }
         } else {
             files::write(&config_path, config.to_toml().as_bytes())?;
@@ -131,7 +131,7 @@ impl<E: Env> Run<E> {
             return self.test();
         }
         let Some(agent) = self.method.as_learner() else {
-            return Err(Error::BadSetting(format!("{} does not learn: its `steps` must be 0", self.config.agent)));
+            return Err(Error::Config(format!("{} does not learn: its `steps` must be 0", self.config.agent)));
         };
         let action = agent.act(&self.obs, Mode::Explore);
         let outcome = self.env.step(&action)?;
@@ -240,12 +240,13 @@ pub fn is_complete(folder: &Path) -> bool {
 
 fn load(path: &Path, method: &mut Method) -> Result<Progress> {
     let foreign = |problem: Error| {
-        Error::bad_file(path, format!("not a checkpoint of this run ({problem}); remove it to start anew"))
+        let advice = format!("not a checkpoint of this run ({problem}); remove it to start anew");
+        Error::checkpoint(path, advice, Some(problem.into()))
     };
     let state = Weights::read(path)?;
-    let progress = state.note("progress").ok_or_else(|| foreign(Error::BadSetting("it tells no progress".into())))?;
+    let progress = state.note("progress").ok_or_else(|| foreign(Error::Config("it tells no progress".into())))?;
     let progress = toml::from_str(progress)
-        .map_err(|problem| foreign(Error::BadSetting(format!("its progress: {}", problem.message()))))?;
+        .map_err(|problem| foreign(Error::Config(format!("its progress: {}", problem.message()))))?;
     let checkpoint = method.checkpoint_mut();
     checkpoint.load_weights(&state.extract("weights.")).map_err(foreign)?;
     checkpoint.load_training_state(&state).map_err(foreign)?;

@@ -55,13 +55,13 @@ impl StudyPlan {
     /// If there is nothing to run, or a method or task is unknown.
     pub fn runs(&self, registry: &Registry) -> Result<Vec<(RunConfig, PathBuf)>> {
         if self.seeds.is_empty() {
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "no seeds in {}..{}; give a number of seeds, or a range like 0..5",
                 self.seeds.start, self.seeds.end
             )));
         }
         if self.tasks.is_empty() || self.methods.is_empty() {
-            return Err(Error::BadSetting("a study needs at least one task and one method".into()));
+            return Err(Error::Config("a study needs at least one task and one method".into()));
         }
         let mut runs = Vec::new();
         for task in &self.tasks {

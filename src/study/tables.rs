@@ -283,7 +283,12 @@ fn read(path: &Path) -> Result<DataFrame> {
     }
     let reader = CsvReadOptions::default().with_infer_schema_length(None);
     let reader = reader.into_reader_with_file_handle(std::io::Cursor::new(bytes));
-    reader.finish().map_err(|problem| Error::bad_file(path, format!("no table of ours ({problem})")))
+    let foreign = |problem: PolarsError| Error::Data {
+        path: path.into(),
+        problem: format!("no table of ours ({problem})"),
+        source: Some(problem.into()),
+    };
+    reader.finish().map_err(foreign)
 }
 
 fn write(path: &Path, table: &DataFrame) -> Result<()> {
@@ -296,5 +301,5 @@ fn write(path: &Path, table: &DataFrame) -> Result<()> {
 
 /// A table of ours that lacks something: it was changed by hand, or comes from another version.
 fn inside(problem: PolarsError) -> Error {
-    Error::BadSetting(format!("the study's tables do not fit together: {problem}"))
+    Error::Config(format!("the study's tables do not fit together: {problem}"))
 }

@@ -78,15 +78,13 @@ impl DreamerConfig {
             self.control.check(planner)?;
         }
         if !self.batch.is_multiple_of(PARTS) || self.batch == 0 || self.length < 2 {
-            return Err(Error::BadSetting(format!(
-                "dreamer: `batch` must be a multiple of {PARTS}, `length` at least 2"
-            )));
+            return Err(Error::Config(format!("dreamer: `batch` must be a multiple of {PARTS}, `length` at least 2")));
         }
         if self.dreams.is_some_and(|dreams| dreams < 2 || dreams > self.length) {
-            return Err(Error::BadSetting("dreamer: `dreams` must lie between 2 and `length`".into()));
+            return Err(Error::Config("dreamer: `dreams` must lie between 2 and `length`".into()));
         }
         if self.warm_up <= self.length || self.train_ratio <= 0.0 {
-            return Err(Error::BadSetting(
+            return Err(Error::Config(
                 "dreamer: `warm_up` must be more than `length`, `train_ratio` more than 0".into(),
             ));
         }
@@ -137,10 +135,10 @@ impl ActorCriticConfig {
     /// If a setting cannot be used.
     pub(crate) fn check(&self) -> Result<()> {
         if self.units == 0 || self.layers == 0 || self.horizon == 0 {
-            return Err(Error::BadSetting("dreamer: `units`, `layers` and `horizon` must be at least 1".into()));
+            return Err(Error::Config("dreamer: `units`, `layers` and `horizon` must be at least 1".into()));
         }
         if !(0.0..=1.0).contains(&self.lambda) || !(0.0..1.0).contains(&self.min_std) || self.min_std <= 0.0 {
-            return Err(Error::BadSetting("dreamer: `lambda` must lie in [0, 1], `min_std` between 0 and 1".into()));
+            return Err(Error::Config("dreamer: `lambda` must lie in [0, 1], `min_std` between 0 and 1".into()));
         }
         Ok(())
     }

@@ -68,13 +68,13 @@ impl PetsConfig {
     pub(super) fn check(&self) -> Result<()> {
         self.control.check(&self.planner)?;
         if !self.particles.is_multiple_of(self.ensemble.elites) || self.particles == 0 {
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "pets: `particles` must be a multiple of the {} elites of the ensemble",
                 self.ensemble.elites
             )));
         }
         if self.warm_up < 2 || self.fit_every == 0 {
-            return Err(Error::BadSetting("pets: `warm_up` must be at least 2, `fit_every` at least 1".into()));
+            return Err(Error::Config("pets: `warm_up` must be at least 2, `fit_every` at least 1".into()));
         }
         Ok(())
     }

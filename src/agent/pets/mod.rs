@@ -107,8 +107,9 @@ impl Pets {
     pub fn new(spec: &Spec, reward: Option<Arc<DynReward>>, config: PetsConfig, seed: u64) -> Result<Self> {
         config.check()?;
         spec.check()?;
+        let reward = reward.filter(|reward| reward.is_known());
         if reward.is_none() && !config.ensemble.learn_reward {
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "pets: the reward of `{}` is not known as a function of observations; set `ensemble.learn_reward = true`",
                 spec.name
             )));

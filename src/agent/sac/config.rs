@@ -79,17 +79,17 @@ impl SacConfig {
         ];
         for (name, value) in positive {
             if value == 0 {
-                return Err(Error::BadSetting(format!("sac: `{name}` must be at least 1")));
+                return Err(Error::Config(format!("sac: `{name}` must be at least 1")));
             }
         }
         if self.hidden.is_empty() || self.hidden.contains(&0) {
-            return Err(Error::BadSetting("sac: `hidden` must name at least one layer, each at least 1 wide".into()));
+            return Err(Error::Config("sac: `hidden` must name at least one layer, each at least 1 wide".into()));
         }
         if !(0.0..=1.0).contains(&self.discount) || !(0.0..=1.0).contains(&self.polyak) {
-            return Err(Error::BadSetting("sac: `discount` and `polyak` must lie in [0, 1]".into()));
+            return Err(Error::Config("sac: `discount` and `polyak` must lie in [0, 1]".into()));
         }
         if self.initial_temperature.is_nan() || self.initial_temperature <= 0.0 {
-            return Err(Error::BadSetting("sac: `initial_temperature` must be positive".into()));
+            return Err(Error::Config("sac: `initial_temperature` must be positive".into()));
         }
         Ok(())
     }

@@ -16,7 +16,7 @@ impl Tabletop {
     /// The Panda at the table with `task`.
     ///
     /// # Errors
-    /// [`Error::BadSetting`] if the task has no observation of the kind that `options` ask for, if its parts do not fit
+    /// [`Error::Config`] if the task has no observation of the kind that `options` ask for, if its parts do not fit
     /// together (features and values, objects and what is drawn), or if its spec makes no sense ([`Spec::check`]).
     pub fn new(task: impl TableTask + 'static, options: TableOptions) -> Result<Self> {
         Self::with_shared(Arc::new(task), options)
@@ -62,7 +62,7 @@ impl Tabletop {
     /// Sets up an episode and takes it back: the features of the spec are known then, and whether the parts of the task
     /// fit together.
     fn try_out(&mut self) -> Result<()> {
-        let refuse = |problem: String| Err(Error::BadSetting(format!("{}: {problem}", self.task.name())));
+        let refuse = |problem: String| Err(Error::Config(format!("{}: {problem}", self.task.name())));
         let mut physics = self.empty.clone();
         let setup = self.task.place(&mut physics, &mut rng::stream(0, "reset"));
         let (drawn, bodies) = (self.task.drawn(&setup).len(), setup.objects.len() + usize::from(setup.goal.is_some()));

@@ -88,20 +88,20 @@ impl EnsembleConfig {
     pub(super) fn check(&self) -> Result<()> {
         for (name, value) in [("members", self.members), ("batch", self.batch), ("check_every", self.check_every)] {
             if value == 0 {
-                return Err(Error::BadSetting(format!("ensemble: `{name}` must be at least 1")));
+                return Err(Error::Config(format!("ensemble: `{name}` must be at least 1")));
             }
         }
         if self.elites == 0 || self.elites > self.members {
-            return Err(Error::BadSetting("ensemble: `elites` must lie between 1 and `members`".into()));
+            return Err(Error::Config("ensemble: `elites` must lie between 1 and `members`".into()));
         }
         if self.hidden.is_empty() || self.hidden.contains(&0) {
-            return Err(Error::BadSetting("ensemble: `hidden` needs at least one layer, each at least 1 wide".into()));
+            return Err(Error::Config("ensemble: `hidden` needs at least one layer, each at least 1 wide".into()));
         }
         if !(0.0..0.9).contains(&self.held_out) {
-            return Err(Error::BadSetting("ensemble: `held_out` must lie in [0, 0.9)".into()));
+            return Err(Error::Config("ensemble: `held_out` must lie in [0, 0.9)".into()));
         }
         if !(0.0..=1.0).contains(&self.final_learning_rate_fraction) {
-            return Err(Error::BadSetting("ensemble: `final_learning_rate_fraction` must lie in [0, 1]".into()));
+            return Err(Error::Config("ensemble: `final_learning_rate_fraction` must lie in [0, 1]".into()));
         }
         Ok(())
     }

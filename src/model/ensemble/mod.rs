@@ -77,7 +77,7 @@ impl Ensemble {
     /// An ensemble with random weights for an environment.
     ///
     /// # Errors
-    /// [`Error::BadSetting`](crate::error::Error::BadSetting) if a setting is out of range, or for the reasons of
+    /// [`Error::Config`](crate::error::Error::Config) if a setting is out of range, or for the reasons of
     /// [`FeatureMap::new`].
     pub fn new(spec: &Spec, config: EnsembleConfig, rng: &mut Rng) -> Result<Self> {
         config.check()?;

@@ -34,7 +34,7 @@ impl FeatureMap {
     /// The feature map of an environment's observations.
     ///
     /// # Errors
-    /// [`Error::BadSetting`] if a difference names a feature that does not exist or is itself a difference, or if no
+    /// [`Error::Config`] if a difference names a feature that does not exist or is itself a difference, or if no
     /// feature is dynamic.
     pub fn new(spec: &Spec) -> Result<Self> {
         let features = &spec.observation;
@@ -42,8 +42,7 @@ impl FeatureMap {
         let mut near = Vec::new();
         let find = |name: &str| {
             let known = features.iter().position(|f| f.name == name && !matches!(f.role, Role::Difference { .. }));
-            known
-                .ok_or_else(|| Error::BadSetting(format!("{}: no feature `{name}` to take a difference of", spec.name)))
+            known.ok_or_else(|| Error::Config(format!("{}: no feature `{name}` to take a difference of", spec.name)))
         };
         for (i, feature) in features.iter().enumerate() {
             match &feature.role {
@@ -63,7 +62,7 @@ impl FeatureMap {
             }
         }
         if predicted.is_empty() {
-            return Err(Error::BadSetting(format!(
+            return Err(Error::Config(format!(
                 "{}: a model needs at least one observation feature with the role `Dynamic`",
                 spec.name
             )));

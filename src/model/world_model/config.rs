@@ -58,12 +58,12 @@ impl WorldModelConfig {
     pub(crate) fn check(&self) -> Result<()> {
         self.rssm.check()?;
         if self.units == 0 || self.layers == 0 || self.bins < 3 || self.bins.is_multiple_of(2) {
-            return Err(Error::BadSetting(
+            return Err(Error::Config(
                 "world model: `units` and `layers` must be at least 1, `bins` odd and at least 3".into(),
             ));
         }
         if self.discount_horizon <= 1.0 {
-            return Err(Error::BadSetting("world model: `discount_horizon` must be more than 1".into()));
+            return Err(Error::Config("world model: `discount_horizon` must be more than 1".into()));
         }
         Ok(())
     }

@@ -29,7 +29,7 @@ impl AgentContext<'_> {
 
     fn oracle(&self, config: OracleConfig) -> Result<Method> {
         let make = self.env.oracle.as_ref().ok_or_else(|| {
-            Error::BadSetting(format!(
+            Error::Config(format!(
                 "{} has no oracle: it was not registered `with_oracle`, which needs `Snapshot`",
                 self.env.name
             ))
@@ -39,7 +39,7 @@ impl AgentContext<'_> {
 
     fn scripted(&self) -> Result<Method> {
         let make = self.env.scripted.as_ref();
-        let make = make.ok_or_else(|| Error::BadSetting(format!("{} has no scripted policy", self.env.name)))?;
+        let make = make.ok_or_else(|| Error::Config(format!("{} has no scripted policy", self.env.name)))?;
         Ok(Method::fixed(make(self.options)?))
     }
 }
@@ -67,7 +67,7 @@ impl AgentEntry {
         make: impl Fn(&AgentContext, C) -> Result<Method> + Send + Sync + 'static,
     ) -> Self {
         let make = move |context: &AgentContext, table: Table| {
-            let problem = |problem: toml::de::Error| Error::BadSetting(problem.message().into());
+            let problem = |problem: toml::de::Error| Error::Config(problem.message().into());
             make(context, table.try_into().map_err(problem)?)
         };
         Self { name: name.into(), learns, complete: completed::<C>, make: Box::new(make) }

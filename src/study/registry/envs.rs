@@ -102,7 +102,7 @@ pub(super) fn completed<S: Settings>(table: Table) -> Result<Table, toml::de::Er
 }
 
 fn parsed<S: Settings>(table: &Table) -> Result<S> {
-    table.clone().try_into().map_err(|problem: toml::de::Error| Error::BadSetting(problem.message().into()))
+    table.clone().try_into().map_err(|problem: toml::de::Error| Error::Config(problem.message().into()))
 }
 
 type Erased<T> = Box<dyn Fn(&Table) -> Result<T> + Send + Sync>;

@@ -211,7 +211,10 @@ impl Registry {
         if config.learns() {
             let path = folder.join("weights.safetensors");
             let weights = Weights::read(&path)?;
-            method.checkpoint_mut().load_weights(&weights).map_err(|problem| Error::bad_file(&path, problem))?;
+            method
+                .checkpoint_mut()
+                .load_weights(&weights)
+                .map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))?;
         }
         Ok((config, method))
     }
