@@ -1,7 +1,7 @@
-//! How far do learned models see? Records episodes, lets an ensemble, an autoencoder and a recurrent state-space model learn
-//! from the same ones, and judges all three on others: `data/foresight/TASK.csv` and `TASK.svg`.
+//! How far ahead do learned models predict? Records episodes, trains an ensemble, an autoencoder and a recurrent state-space
+//! model on them, and measures the open-loop error of all three on held-out episodes: `data/open_loop/TASK.csv` and `TASK.svg`.
 //!
-//! `cargo run --example foresight` (a few minutes); with names of tasks, only for those.
+//! `cargo run --example open_loop` (a few minutes) runs `reach` and `push`; give names of tasks to run others.
 
 use std::error::Error;
 use std::path::Path;
@@ -19,16 +19,16 @@ use plotters::prelude::*;
 
 const TRAINING: u64 = 60;
 const HELD_OUT: u64 = 20;
-/// Steps of learning of each model.
+/// Gradient steps for each model.
 const STEPS: usize = 4000;
-/// How many episodes' worth of the scripted policy is in an action, by turns; the rest is noise.
+/// The weight of the scripted policy in the actions of an episode, in turn; the rest is noise.
 const SKILL: [f64; 3] = [1.0, 0.7, 0.0];
 
-/// Episodes of the scripted policy, of a noisy one, and of noise alone.
+/// Episodes of the scripted policy, of a noisy version of it, and of noise alone.
 struct Recording {
     episodes: Vec<Episode>,
     transitions: ReplayBuffer,
-    moments: SequenceReplay,
+    sequences: SequenceReplay,
 }
 
 fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Recording, Box<dyn Error>> {
@@ -39,7 +39,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
     let mut recording = Recording {
         episodes: Vec::new(),
         transitions: ReplayBuffer::new(size, action_size, usize::MAX),
-        moments: SequenceReplay::new(size, action_size, usize::MAX),
+        sequences: SequenceReplay::new(size, action_size, usize::MAX),
     };
     for seed in seeds {
         let skill = SKILL[seed as usize % SKILL.len()];
@@ -48,7 +48,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
         let mut episode = Episode { observations: vec![obs.clone()], ..Episode::default() };
         for noise in noise.chunks_exact(action_size) {
             let mixed =
-                policy(&obs).into_iter().zip(noise).map(|(wise, wild)| skill * f64::from(wise) + (1.2 - skill) * wild);
+                policy(&obs).into_iter().zip(noise).map(|(scripted, noise)| skill * f64::from(scripted) + (1.2 - skill) * noise);
             let action: Vec<f32> = mixed.map(|a| a.clamp(-1.0, 1.0) as f32).collect();
             let step = world.step(&action)?;
             episode.actions.push(action.clone());
@@ -64,7 +64,7 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
                 truncated: step.truncated,
             };
             recording.transitions.push(&transition);
-            recording.moments.push(&transition);
+            recording.sequences.push(&transition);
             if done {
                 break;
             }
@@ -84,13 +84,14 @@ struct Row {
     coverage90: f64,
 }
 
-/// A model that is asked only for what all models tell alike: how a cube lies, latent ones tell under other names.
-struct Alike<'a, Model> {
+/// Restricts a model to the features that all models predict in the same form. The latent models do not predict the
+/// orientation of a cube in the form in which it is observed.
+struct Comparable<'a, Model> {
     model: &'a Model,
     spec: &'a Spec,
 }
 
-impl<Model: OpenLoopModel> OpenLoopModel for Alike<'_, Model> {
+impl<Model: OpenLoopModel> OpenLoopModel for Comparable<'_, Model> {
     fn predicted(&self) -> Vec<(usize, f32)> {
         self.model.predicted().into_iter().filter(|(i, _)| self.spec.observation[*i].cube.is_none()).collect()
     }
@@ -100,8 +101,8 @@ impl<Model: OpenLoopModel> OpenLoopModel for Alike<'_, Model> {
     }
 }
 
-fn judge(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
-    for row in open_loop(&Alike { model, spec }, episodes, &mut rng::stream(0, "judge")) {
+fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
+    for row in open_loop(&Comparable { model, spec }, episodes, &mut rng::stream(0, "judge")) {
         let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
         println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
         rows.push(Row { model: name, horizon, rmse, rmse_p90, coverage90 });
@@ -112,7 +113,7 @@ fn study(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let mut rng = rng::stream(0, "foresight");
     let training = record(task, 0..TRAINING, &mut rng)?;
     let held_out = record(task, 1000..1000 + HELD_OUT, &mut rng)?.episodes;
-    println!("{}: {} steps to learn from", task.name(), training.transitions.len());
+    println!("{}: {} training steps", task.name(), training.transitions.len());
     let world = task.make();
     let spec = world.spec();
     let mut rows = Vec::new();
@@ -120,23 +121,23 @@ fn study(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let config = EnsembleConfig { hidden: vec![200, 200], first_steps: STEPS, ..EnsembleConfig::default() };
     let mut ensemble = Ensemble::new(spec, config, &mut rng)?;
     ensemble.fit(&training.transitions, &mut rng);
-    judge("ensemble", &ensemble.dynamics(), spec, &held_out, &mut rows);
+    evaluate("ensemble", &ensemble.dynamics(), spec, &held_out, &mut rows);
 
     let mut autoencoder = Autoencoder::new(spec, &AutoencoderConfig::default(), &mut rng);
     let mut optimiser = Adam::new(AdamConfig { max_norm: Some(10.0), ..AdamConfig::new(1e-3) });
     for _ in 0..STEPS {
-        autoencoder.learn(&training.moments.sample(16, 16, &mut rng), &mut optimiser);
+        autoencoder.learn(&training.sequences.sample(16, 16, &mut rng), &mut optimiser);
     }
-    judge("autoencoder", &autoencoder, spec, &held_out, &mut rows);
+    evaluate("autoencoder", &autoencoder, spec, &held_out, &mut rows);
 
     let DreamerConfig { world: config, learning_rate, batch, length, .. } =
         DreamerConfig::preset_for("dreamer", task.name())?;
     let mut rssm = WorldModel::new(spec, &config, &mut rng);
     let mut optimiser = Adam::new(AdamConfig { warm_up: 100, ..AdamConfig::laprop(learning_rate) });
     for _ in 0..STEPS {
-        rssm.learn(&training.moments.sample(batch, length, &mut rng), &mut optimiser, &mut rng);
+        rssm.learn(&training.sequences.sample(batch, length, &mut rng), &mut optimiser, &mut rng);
     }
-    judge("rssm", &rssm, spec, &held_out, &mut rows);
+    evaluate("rssm", &rssm, spec, &held_out, &mut rows);
 
     std::fs::create_dir_all(folder)?;
     let mut writer = csv::Writer::from_path(folder.join(format!("{}.csv", task.name())))?;
@@ -150,7 +151,7 @@ fn draw(task: Task, rows: &[Row], path: &Path) -> Result<(), Box<dyn Error>> {
     area.fill(&WHITE)?;
     let worst = rows.iter().map(|row| row.rmse).fold(1.1, f64::max).min(2.0);
     let mut chart = ChartBuilder::on(&area)
-        .caption(format!("{}: how far learned models see", task.name()), ("sans-serif", 20))
+        .caption(format!("{}: open-loop error of learned models", task.name()), ("sans-serif", 20))
         .margin(14)
         .x_label_area_size(44)
         .y_label_area_size(54)
@@ -158,8 +159,8 @@ fn draw(task: Task, rows: &[Row], path: &Path) -> Result<(), Box<dyn Error>> {
     chart
         .configure_mesh()
         .light_line_style(WHITE)
-        .x_desc("steps ahead, eyes closed")
-        .y_desc("error (1: foreseeing no change)")
+        .x_desc("steps ahead, open loop")
+        .y_desc("error (1: predicting no change)")
         .label_style(("sans-serif", 14))
         .draw()?;
     chart.draw_series(DashedLineSeries::new(
@@ -190,5 +191,5 @@ fn draw(task: Task, rows: &[Row], path: &Path) -> Result<(), Box<dyn Error>> {
 fn main() -> Result<(), Box<dyn Error>> {
     let named: Result<Vec<Task>, _> = std::env::args().skip(1).map(|name| name.parse()).collect();
     let tasks = Some(named?).filter(|tasks| !tasks.is_empty()).unwrap_or_else(|| vec![Task::Reach, Task::Push]);
-    tasks.into_iter().try_for_each(|task| study(task, Path::new("data/foresight")))
+    tasks.into_iter().try_for_each(|task| study(task, Path::new("data/open_loop")))
 }
