@@ -5,7 +5,7 @@
 
 use std::error::Error;
 
-use handful::diff::{Pusher, Recording};
+use handful::diff::{Pusher, RecordedPush};
 use handful::env::{Env, Task};
 use handful::model::{Ensemble, EnsembleConfig, FeatureMap};
 use handful::plan::noise::ColoredNoise;
@@ -60,9 +60,9 @@ impl Push {
         Ok(push)
     }
 
-    fn seen(&self) -> Recording {
+    fn seen(&self) -> RecordedPush {
         let numbers = |obs: &Vec<f32>, i: usize| f64::from(obs[i]);
-        Recording {
+        RecordedPush {
             hand: self.observations.iter().map(|obs| [numbers(obs, 0), numbers(obs, 1)]).collect(),
             block: self.observations.iter().map(|obs| pose(obs)).collect(),
         }
@@ -96,7 +96,7 @@ impl Push {
                 obs[i] = *change as f32;
             }
             obs[..CUBE].copy_from_slice(&seen[..CUBE]);
-            layout.complete(&mut obs);
+            layout.recompute_derived(&mut obs);
             poses.push(pose(&obs));
         }
         poses

@@ -7,7 +7,7 @@ use std::error::Error;
 use std::time::{Duration, Instant};
 
 use handful::agent::Mode;
-use handful::diff::{AnalyticPolicyGradient, PendulumSwing, PolicySearchConfig};
+use handful::diff::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PendulumSwing};
 use handful::env::pendulum::Pendulum;
 use handful::prelude::*;
 use handful::rng;
@@ -52,7 +52,7 @@ fn judge(mut act: impl FnMut(&[f32]) -> f32) -> Result<f64, Box<dyn Error>> {
 fn by_gradients(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
     const STEPS: usize = 200_000;
     let mut rng = rng::stream(seed, "policies");
-    let mut search = AnalyticPolicyGradient::new(&PendulumSwing, PolicySearchConfig::default(), &mut rng);
+    let mut search = AnalyticPolicyGradient::new(&PendulumSwing, AnalyticPolicyGradientConfig::default(), &mut rng);
     let mut spent = Duration::ZERO;
     while search.steps < STEPS {
         let clock = Instant::now();

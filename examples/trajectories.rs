@@ -8,8 +8,8 @@ use std::f64::consts::PI;
 use std::time::Instant;
 
 use handful::diff::pusher::STATE;
-use handful::diff::{CartPoleSwing, Ilqr, IlqrConfig, PendulumSwing, Pusher, PusherTask, System, roll_out};
-use handful::plan::{CemConfig, GradientConfig, IcemConfig, PlannerConfig, Simulated};
+use handful::diff::{CartPoleSwing, Ilqr, IlqrConfig, PendulumSwing, Pusher, PusherTask, Simulated, System, roll_out};
+use handful::plan::{CemConfig, GradientConfig, IcemConfig, PlannerConfig};
 use handful::rng::{self, uniform};
 use nalgebra::SVector;
 

@@ -110,6 +110,9 @@ pub mod rng;
 pub mod study;
 pub mod watch;
 
+/// Vectors, matrices and rotations: the crate that poses, Jacobians and differentiable systems here are made of.
+pub use nalgebra;
+
 /// What most programs that use this crate need.
 pub mod prelude {
     pub use crate::agent::{

@@ -5,8 +5,8 @@ use std::f64::consts::PI;
 use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_forward, linearise};
 use handful::diff::pusher::STATE;
 use handful::diff::{
-    AnalyticPolicyGradient, CartPoleSwing, Ilqr, IlqrConfig, IlqrControl, PendulumSwing, PolicySearchConfig, Pusher,
-    PusherTask, Recording, System,
+    AnalyticPolicyGradient, AnalyticPolicyGradientConfig, CartPoleSwing, Ilqr, IlqrConfig, IlqrControl, PendulumSwing,
+    Pusher, PusherTask, RecordedPush, System,
 };
 use handful::env::cartpole::CartPoleState;
 use handful::env::pendulum::{Pendulum, PendulumState};
@@ -158,7 +158,7 @@ fn mass_and_friction_are_found_again() {
     let task = PusherTask { pusher: truth, goal: [0.1, 0.0] };
     let mut state = SVector::<f64, STATE>::zeros();
     (state[0], state[1]) = (-0.04, 0.006);
-    let mut recording = Recording::default();
+    let mut recording = RecordedPush::default();
     for t in 0..40 {
         recording.hand.push([state[0], state[1]]);
         recording.block.push([state[2], state[3], state[4]]);
@@ -219,7 +219,7 @@ fn ilqr_controls_the_environment_with_a_receding_horizon() {
 #[test]
 fn a_policy_learns_through_the_simulator() {
     let mut rng = rng::stream(5, "diff");
-    let mut search = AnalyticPolicyGradient::new(&PendulumSwing, PolicySearchConfig::default(), &mut rng);
+    let mut search = AnalyticPolicyGradient::new(&PendulumSwing, AnalyticPolicyGradientConfig::default(), &mut rng);
     while search.steps < 200_000 {
         search.update(&PendulumSwing, &mut rng);
     }

@@ -101,7 +101,7 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
             assert!(said.epistemic[0] < said.aleatoric[0], "with so much data, chance is the greater part");
             let total = (said.aleatoric[0] + said.epistemic[0]).sqrt();
             let outcome = f64::from(step(&obs, action, &mut rng)[0]);
-            judged.push(GaussianForecast { mean: said.mean[0], deviation: total, outcome });
+            judged.push(GaussianForecast { mean: said.mean[0], std: total, outcome });
         }
         let inside = coverage(&judged, 0.9);
         assert!((0.84..0.97).contains(&inside), "{inside} of the outcomes lie in the interval of 90 %");
@@ -249,7 +249,7 @@ fn latent_models_foresee_too() {
         wrong += (told - truth).abs() / episode.actions.len() as f32;
     }
     assert!(wrong < 0.15, "rewards between -3 and 0 are told to {wrong}");
-    assert!((world.continues(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
+    assert!((world.continuations(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
 }
 
 /// The tape's gradients against central differences, for known and for learned rewards.

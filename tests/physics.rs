@@ -215,7 +215,7 @@ fn the_fingers_move_as_in_robosuite() {
 
 #[test]
 fn without_an_action_the_arm_holds_still() {
-    let mut env = Tabletop::new(&Lift, pose_actions());
+    let mut env = Tabletop::new(Lift, pose_actions()).expect("options for lift");
     env.reset(0);
     let start = env.hand().expect("a hand");
     for _ in 0..200 {
@@ -228,7 +228,8 @@ fn without_an_action_the_arm_holds_still() {
 
 /// A grasped cube, the hand above the table.
 fn grasped(seed: u64) -> Tabletop {
-    let mut env = Tabletop::new(&Lift, TableOptions { horizon: Some(10_000), ..TableOptions::default() });
+    let mut env = Tabletop::new(Lift, TableOptions { horizon: Some(10_000), ..TableOptions::default() })
+        .expect("options for lift");
     let policy = handful::env::Task::Lift.scripted_policy(TableOptions::default()).expect("lift has one");
     let mut obs = env.reset(seed);
     for _ in 0..60 {

@@ -1,10 +1,10 @@
 //! Policies that do not learn: the lower bound, and what a person would write.
 
 use super::{Agent, Checkpoint, Mode};
+use crate::checkpoint::Weights;
 use crate::env::tabletop::{ObservationKind, TableOptions};
 use crate::env::{Spec, Task};
 use crate::error::{Error, Result};
-use crate::checkpoint::Weights;
 use crate::rng::{self, Rng};
 
 /// Uniform random actions.

@@ -44,10 +44,10 @@ pub use slots::{Slot, Slots};
 
 use std::collections::BTreeMap;
 
+use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::model::open_loop::OpenLoop;
 use crate::replay::Episode;
-use crate::checkpoint::Weights;
 use crate::replay::Transition;
 
 /// Why an agent is asked to act.

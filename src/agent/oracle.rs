@@ -8,9 +8,9 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{Checkpoint, Policy, Slot, Slots};
+use crate::checkpoint::Weights;
 use crate::env::{Env, Snapshot};
 use crate::error::{Error, Result};
-use crate::checkpoint::Weights;
 use crate::plan::{ActionSequences, ControlConfig, IcemConfig, MakePlanner, PlannerConfig, RecedingHorizon};
 use crate::rng::{self, Rng};
 

@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::model::open_loop::Episode;
 use crate::nn::ops;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, Weights,
+    Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, Weights, adam_step,
     copy_parameters, device, polyak, tensor, values,
 };
 use crate::replay::{Batch, ReplayBuffer, Transition};
@@ -373,11 +373,10 @@ impl Temperature {
     fn step(&mut self, entropy_gap: f32) {
         let gradient = -entropy_gap;
         self.steps += 1;
-        self.moments[0] += 0.1 * (gradient - self.moments[0]);
-        self.moments[1] += 0.001 * (gradient * gradient - self.moments[1]);
-        let first = self.moments[0] / (1.0 - 0.9_f32.powi(self.steps));
-        let second = self.moments[1] / (1.0 - 0.999_f32.powi(self.steps));
-        self.log -= self.rate * first / (second.sqrt() + 1e-8);
+        let corrections = [0.9_f32, 0.999].map(|beta| 1.0 - beta.powi(self.steps));
+        let unbiased = |[m, v]: [f32; 2]| [m / corrections[0], v / corrections[1]];
+        let [m, v] = adam_step(gradient, self.moments.each_mut(), [0.1, 0.001], unbiased);
+        self.log -= self.rate * m / (v.sqrt() + 1e-8);
     }
 }
 

@@ -1,8 +1,24 @@
-//! Operational-space control: torques that make the hand behave like a damped spring in Cartesian
-//! space (Khatib 1987), with robosuite's gains and conventions.
+//! Operational-space control (OSC): torques that make the hand behave like a critically damped spring in Cartesian space
+//! (O. Khatib, "A unified approach for motion and force control of robot manipulators: the operational space formulation",
+//! IEEE Journal of Robotics and Automation 3(1), 1987), with the gains and conventions of robosuite's OSC_POSE.
 //!
 //! The torques come without the part that carries the arm's weight, since the physics switches
 //! gravity off for the arm; that part still counts towards the torque limits, as in robosuite.
+//!
+//! ```
+//! use handful::env::arm::{ArmDescription, JointVector};
+//! use handful::env::kinematics::KinematicModel;
+//! use handful::env::osc::{Goal, OperationalSpaceController};
+//!
+//! let arm = ArmDescription::panda();
+//! let home = KinematicModel::new(&arm).at(&arm.home);
+//! let here = Goal { position: home.grip.translation.vector, orientation: home.grip.rotation };
+//! let mut controller = OperationalSpaceController::new(&arm, here, arm.home);
+//! // At rest at its goal, the arm needs no torque but for its weight.
+//! assert!(controller.torques(&home, &arm.home, &JointVector::zeros()).norm() < 1e-9);
+//! controller.goal.position.x += 0.05;
+//! assert!(controller.torques(&home, &arm.home, &JointVector::zeros()).norm() > 1.0);
+//! ```
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, UnitQuaternion, Vector3, Vector6};
 
@@ -14,7 +30,7 @@ const STIFFNESS: f64 = 150.0;
 /// Stiffness of the spring that draws the elbow to its reset posture, 1/s2.
 const POSTURE_STIFFNESS: f64 = 10.0;
 
-/// Where the hand should go: position (m) and orientation of the grip site, world frame.
+/// The goal of the hand: position (m) and orientation of the grip site, world frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Goal {
     /// Position of the grip site.
@@ -24,9 +40,12 @@ pub struct Goal {
 }
 
 /// The controller: fixed impedance, critically damped, position and orientation decoupled.
+#[doc(alias = "OSC")]
+#[doc(alias = "OSC_POSE")]
+#[doc(alias = "Khatib")]
 #[derive(Clone, Debug)]
 pub struct OperationalSpaceController {
-    /// Where the hand should go.
+    /// The goal of the hand.
     pub goal: Goal,
     /// The joint angles that the null space is drawn to, rad.
     pub posture: JointVector,
@@ -40,19 +59,30 @@ impl OperationalSpaceController {
     }
 
     /// Joint torques (N m), beyond those that carry its weight, for the arm at joint angles `q` (rad), moving at `qd` (rad/s), whose
-    /// kinematics are `at`.
+    /// kinematics are `at`. Motors saturate at their largest torque.
     pub fn torques(&self, at: &Kinematics, q: &JointVector, qd: &JointVector) -> JointVector {
-        let damping = 2.0 * STIFFNESS.sqrt();
-        let position_error = self.goal.position - at.grip.translation.vector;
-        let rotation_error = rotation_error(&at.grip.rotation, &self.goal.orientation);
-        let force = position_error * STIFFNESS - at.linear * qd * damping;
-        let moment = rotation_error * STIFFNESS - at.angular * qd * damping;
+        let torque = self.operational_space_torque(at, q, qd);
+        // A motor that already carries the arm has less to spare in that direction.
+        let motor =
+            (torque + at.coriolis(qd) + at.gravity).zip_map(&self.max_torque, |torque, max| torque.clamp(-max, max));
+        motor - at.gravity
+    }
 
-        // Operational-space inertia: (J M^-1 J')^-1, for position, orientation, and both together.
+    /// The operational-space torque (Khatib 1987, Eqs. 28, 51 and 52), before Coriolis forces and gravity:
+    ///
+    /// tau = Jp' Lp Fp + Jr' Lr Fr + (I - J' L J M^-1) M a0
+    ///
+    /// with the operational-space inertia L = (J M^-1 J')^-1. Deviation, as in robosuite: position and orientation are
+    /// decoupled, each with the inertia (Lp, Lr) that it would have without the other; only the null-space projection, which
+    /// keeps the posture's acceleration a0 from moving the hand, has both together.
+    fn operational_space_torque(&self, at: &Kinematics, q: &JointVector, qd: &JointVector) -> JointVector {
+        let (force, moment) = self.accelerations(at, qd);
+
         let mut jacobian = SMatrix::<f64, 6, JOINTS>::zeros();
         jacobian.fixed_rows_mut::<3>(0).copy_from(&at.linear);
         jacobian.fixed_rows_mut::<3>(3).copy_from(&at.angular);
         let inverse_mass = at.mass.cholesky().expect("a mass matrix is positive definite");
+        // The mobility J M^-1 J' is the inverse of the operational-space inertia; what follows solves instead of inverting.
         let mobility: Matrix6<f64> = jacobian * inverse_mass.solve(&jacobian.transpose());
         let for_position: Matrix3<f64> = mobility.fixed_view::<3, 3>(0, 0).into();
         let for_rotation: Matrix3<f64> = mobility.fixed_view::<3, 3>(3, 3).into();
@@ -60,15 +90,20 @@ impl OperationalSpaceController {
         let task =
             at.linear.transpose() * solve(for_position, force) + at.angular.transpose() * solve(for_rotation, moment);
 
-        // The posture may use only what the hand does not feel.
         let posture = (self.posture - q) * POSTURE_STIFFNESS - qd * (2.0 * POSTURE_STIFFNESS.sqrt());
         let felt: Vector6<f64> = jacobian * posture;
         let null_space = at.mass * posture - jacobian.transpose() * solve(mobility, felt);
+        task + null_space
+    }
 
-        // A motor that already carries the arm has less to spare in that direction.
-        let motor = (task + null_space + at.coriolis(qd) + at.gravity)
-            .zip_map(&self.max_torque, |torque, max| torque.clamp(-max, max));
-        motor - at.gravity
+    /// The linear (m/s2) and angular (rad/s2) acceleration that a critically damped spring gives the hand: Fp and Fr above.
+    fn accelerations(&self, at: &Kinematics, qd: &JointVector) -> (Vector3<f64>, Vector3<f64>) {
+        let damping = 2.0 * STIFFNESS.sqrt();
+        let position_error = self.goal.position - at.grip.translation.vector;
+        let rotation_error = rotation_error(&at.grip.rotation, &self.goal.orientation);
+        let force = position_error * STIFFNESS - at.linear * qd * damping;
+        let moment = rotation_error * STIFFNESS - at.angular * qd * damping;
+        (force, moment)
     }
 }
 

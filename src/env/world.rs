@@ -1,4 +1,6 @@
-//! The worlds of this crate by name.
+//! The environments of this crate by name.
+
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
@@ -6,13 +8,14 @@ use super::arm::Pose;
 use super::cartpole::{CartPole, CartPoleState};
 use super::pendulum::{Pendulum, PendulumState};
 use super::scene::{Body, Camera};
-use super::tabletop::{ActionKind, Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
+use super::tabletop::{Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
 use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::{Error, Result};
 
-/// The tasks of this crate.
+/// The tasks of this crate: each makes an environment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Task {
     /// Bring the hand to a point: [`super::tabletop::Reach`].
     Reach,
@@ -32,7 +35,7 @@ impl Task {
     /// All tasks.
     pub const ALL: [Task; 6] = [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum, Task::Cartpole];
 
-    /// Its name, as the command line has it.
+    /// Its name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Task::Reach => "reach",
@@ -45,40 +48,35 @@ impl Task {
     }
 
     /// The arm's part of the task, for tasks at the table.
-    fn at_table(self) -> Option<&'static dyn TableTask> {
+    fn at_table(self) -> Option<Arc<dyn TableTask>> {
         match self {
-            Task::Reach => Some(&Reach),
-            Task::Push => Some(&Push),
-            Task::Lift => Some(&Lift),
-            Task::Stack => Some(&Stack),
+            Task::Reach => Some(Arc::new(Reach)),
+            Task::Push => Some(Arc::new(Push)),
+            Task::Lift => Some(Arc::new(Lift)),
+            Task::Stack => Some(Arc::new(Stack)),
             Task::Pendulum | Task::Cartpole => None,
         }
     }
 
-    /// The hand-written policy of an arm task: from a compact observation to an action.
+    /// The hand-written policy of an arm task, from compact observations to actions. None for the others.
     pub fn scripted_policy(self, options: TableOptions) -> Option<impl Fn(&[f32]) -> Vec<f32> + Send + use<>> {
         let task = self.at_table()?;
-        Some(move |obs: &[f32]| {
-            let [x, y, z, grip] = task.scripted(obs).map(|a| a.clamp(-1.0, 1.0) as f32);
-            match options.action {
-                ActionKind::Hand => vec![x, y, z, grip],
-                ActionKind::Pose => vec![x, y, z, 0.0, 0.0, 0.0, grip],
-            }
-        })
+        Some(move |obs: &[f32]| options.action_of_hand(task.scripted(obs).expect("our tasks have one")))
     }
 
-    /// A world for the task, with default options.
+    /// An environment for the task, with default options.
     pub fn make(self) -> World {
         self.make_with(TableOptions::default()).expect("default options suit every task")
     }
 
-    /// A world for the task.
+    /// An environment for the task.
     ///
     /// # Errors
-    /// If `options` ask of a classic what only the arm can do.
+    /// [`Error::BadSetting`] if pendulum or cart-pole are given options, which only arm tasks have, or if the options do not
+    /// make sense.
     pub fn make_with(self, options: TableOptions) -> Result<World> {
         if let Some(task) = self.at_table() {
-            return Ok(World::Tabletop(Box::new(Tabletop::new(task, options))));
+            return Ok(Tabletop::with_shared(task, options)?.into());
         }
         if options != TableOptions::default() {
             return Err(Error::BadSetting(format!("{} has no options; those are for the arm's tasks", self.name())));
@@ -105,7 +103,18 @@ impl std::str::FromStr for Task {
     }
 }
 
-/// Any of the worlds of this crate.
+/// Any of the environments of this crate, in one type.
+///
+/// ```
+/// use handful::prelude::*;
+///
+/// let task: Task = "reach".parse()?;
+/// let env = task.make_with(TableOptions { horizon: Some(50), ..TableOptions::default() })?;
+/// assert_eq!((env.spec().name.as_str(), env.spec().horizon), ("reach", 50));
+/// # Ok::<(), Error>(())
+/// ```
+#[derive(Debug)]
+#[non_exhaustive]
 #[allow(clippy::large_enum_variant)] // one of them exists at a time
 pub enum World {
     /// An arm task.
@@ -116,8 +125,25 @@ pub enum World {
     CartPole(CartPole),
 }
 
-/// A state of any of the worlds.
-#[derive(Clone)]
+impl World {
+    /// The arm at its table, if this is an arm task.
+    pub fn tabletop(&self) -> Option<&Tabletop> {
+        match self {
+            World::Tabletop(world) => Some(world),
+            _ => None,
+        }
+    }
+}
+
+impl From<Tabletop> for World {
+    fn from(world: Tabletop) -> Self {
+        World::Tabletop(Box::new(world))
+    }
+}
+
+/// A state of any of the environments ([`Snapshot`]).
+#[derive(Clone, Debug)]
+#[non_exhaustive]
 pub enum WorldState {
     /// Of an arm task.
     Tabletop(Box<TabletopState>),
@@ -127,7 +153,7 @@ pub enum WorldState {
     CartPole(CartPoleState),
 }
 
-/// The same call on whichever world it is.
+/// Makes the same call on any of the environments.
 macro_rules! delegate {
     ($world:expr, $inner:ident => $call:expr) => {
         match $world {
@@ -173,6 +199,10 @@ impl Env for World {
 }
 
 impl KnownReward for World {
+    fn is_known(&self) -> bool {
+        delegate!(self, world => world.is_known())
+    }
+
     fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32 {
         delegate!(self, world => world.reward(obs, action, next_obs))
     }
@@ -194,7 +224,7 @@ impl Snapshot for World {
     }
 
     /// # Panics
-    /// If the state is of another kind of world.
+    /// If the state is one of another kind of environment.
     fn restore(&mut self, state: &WorldState) {
         match (self, state) {
             (World::Tabletop(world), WorldState::Tabletop(state)) => world.restore(state),

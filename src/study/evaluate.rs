@@ -10,7 +10,7 @@ use crate::agent::{Policy, Slot};
 use crate::env::Env;
 use crate::env::vector::VectorEnv;
 use crate::error::{Error, Result};
-use crate::model::open_loop::Episode;
+use crate::replay::Episode;
 
 /// Environments that are stepped side by side; agents act in all of them in one forward pass.
 const ENVS: usize = 20;

@@ -7,6 +7,7 @@ pub mod config;
 pub mod evaluate;
 #[cfg(feature = "study")]
 pub mod figures;
+pub mod records;
 pub mod registry;
 #[cfg(feature = "study")]
 pub mod report;

@@ -1,151 +1,26 @@
-//! One run: an agent learns a task, is evaluated on the way and tested at the end; all of it in a
-//! folder that survives crashes and can be resumed.
+//! One run: a method learns a task, is evaluated on the way and tested at the end; all of it in a folder that survives
+//! crashes and can be resumed.
 //!
-//! The folder holds `config.toml`, `episodes.csv`, `evaluations.csv`, `losses.csv`, `weights.safetensors`, of agents that
-//! foresee something `model.csv` and `values.csv`, at the end `test.csv`, and `checkpoint/state.safetensors`, the one file that a resumed run starts
-//! from. Every file is written under a temporary name and renamed.
+//! The folder holds `config.toml`, the tables of [`records`](super::records), `weights.safetensors`, and
+//! `checkpoint/state.safetensors`, the one file that a resumed run starts from. Every file is written under a temporary
+//! name and renamed.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use serde::{Deserialize, Serialize};
-
 use super::config::RunConfig;
-use super::evaluate::{EvalSeeds, Evaluation, Evaluator, Summary};
-use super::statistics::{correlation, mean};
-use crate::agent::{Losses, Method, Mode, ValueEstimate};
+use super::evaluate::{EvalSeeds, Evaluation, Evaluator};
+use super::records::{self, EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
+use crate::agent::{Method, Mode};
+use crate::checkpoint::Weights;
 use crate::env::Env;
 use crate::env::contract::Checked;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::model::open_loop::OpenLoop;
-use crate::checkpoint::Weights;
 use crate::replay::Transition;
 
 /// A checkpoint is due after this long.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(30);
-/// Losses are averaged over this many steps for `losses.csv`.
-const LOSSES_EVERY: usize = 500;
-
-/// A row of `episodes.csv`: one training episode.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct EpisodeRow {
-    /// Environment steps at its end.
-    pub step: usize,
-    /// Its number, from 1.
-    pub episode: usize,
-    /// Sum of rewards.
-    #[serde(rename = "return")]
-    pub total: f64,
-    /// Whether the task was fulfilled at its last step.
-    pub success: bool,
-    /// Steps in it.
-    pub length: usize,
-    /// Seconds of training at its end.
-    pub seconds: f64,
-}
-
-/// A row of `evaluations.csv`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct EvaluationRow {
-    /// Environment steps so far.
-    pub step: usize,
-    /// Episodes judged.
-    pub episodes: usize,
-    /// Success rate.
-    pub success: f64,
-    /// Mean return.
-    pub return_mean: f64,
-    /// Standard deviation of the return.
-    pub return_std: f64,
-    /// Mean spectral arc length of the hand's speed.
-    pub smoothness_sparc: Option<f64>,
-    /// Mean log dimensionless jerk of the hand.
-    pub smoothness_ldlj: Option<f64>,
-    /// Milliseconds to choose an action.
-    pub action_ms: f64,
-}
-
-impl EvaluationRow {
-    fn new(step: usize, summary: Summary) -> Self {
-        let Summary {
-            episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms, ..
-        } = summary;
-        Self { step, episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms }
-    }
-}
-
-/// A row of `losses.csv`: the mean of one loss over the last steps.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LossRow {
-    /// Environment steps so far.
-    pub step: usize,
-    /// What it is.
-    pub name: String,
-    /// Its mean.
-    pub value: f32,
-}
-
-/// A row of `model.csv`: how well the model foresees the last evaluation's episodes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ModelRow {
-    /// Environment steps so far.
-    pub step: usize,
-    /// The errors.
-    #[serde(flatten)]
-    pub open_loop: OpenLoop,
-}
-
-/// A row of `values.csv`: what the agent expected of the last evaluation's episodes, and what came.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ValueRow {
-    /// Environment steps so far.
-    pub step: usize,
-    /// Mean of what it expected.
-    pub expected: f64,
-    /// Mean of what came.
-    pub realised: f64,
-    /// Root mean square of the difference.
-    pub rmse: f64,
-    /// Correlation of the two over all moments; 0 if one of them never changes.
-    pub correlation: f64,
-}
-
-impl ValueRow {
-    fn new(step: usize, moments: &[ValueEstimate]) -> Option<Self> {
-        let expected: Vec<f64> = moments.iter().map(|moment| f64::from(moment.expected)).collect();
-        let realised: Vec<f64> = moments.iter().map(|moment| f64::from(moment.realised)).collect();
-        let square = |(e, r): (&f64, &f64)| (e - r).powi(2);
-        let squares: Vec<f64> = expected.iter().zip(&realised).map(square).collect();
-        (!moments.is_empty()).then(|| Self {
-            step,
-            expected: mean(&expected),
-            realised: mean(&realised),
-            rmse: mean(&squares).sqrt(),
-            correlation: correlation(&expected, &realised),
-        })
-    }
-}
-
-/// What a run has seen so far; the CSV files are this.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
-struct Progress {
-    step: usize,
-    seconds: f64,
-    episodes: Vec<EpisodeRow>,
-    evaluations: Vec<EvaluationRow>,
-    losses: Vec<LossRow>,
-    #[serde(default)]
-    model: Vec<ModelRow>,
-    #[serde(default)]
-    values: Vec<ValueRow>,
-    /// The test, as far as it has come.
-    #[serde(default)]
-    test: Evaluation,
-    /// Sum and count of each loss since the last row of it.
-    pending: BTreeMap<String, (f32, usize)>,
-}
 
 /// What happened in a [`Run::step`].
 #[derive(Clone, Debug)]
@@ -156,7 +31,7 @@ pub enum Event {
     EpisodeEnded(EpisodeRow),
     /// An evaluation during training.
     Evaluated(EvaluationRow),
-    /// So many episodes of the test at the end are judged and saved; more are to come.
+    /// This many episodes of the test at the end are done and saved; more are to come.
     Testing(usize),
     /// The whole test; the run is complete.
     Tested(Evaluation),
@@ -273,7 +148,7 @@ impl<E: Env> Run<E> {
         self.progress.step += 1;
         self.episode_return += f64::from(outcome.reward);
         self.episode_length += 1;
-        self.note(losses);
+        self.progress.note(losses);
         if !outcome.done() {
             return Ok(Event::Stepped);
         }
@@ -308,18 +183,6 @@ impl<E: Env> Run<E> {
         self.progress.seconds + self.clock.elapsed().as_secs_f64()
     }
 
-    fn note(&mut self, losses: Losses) {
-        let Progress { step, losses: rows, pending, .. } = &mut self.progress;
-        for (name, value) in losses {
-            let (sum, count) = pending.entry(name.into()).or_default();
-            (*sum, *count) = (*sum + value, *count + 1);
-        }
-        if step.is_multiple_of(LOSSES_EVERY) {
-            let means = std::mem::take(pending).into_iter();
-            rows.extend(means.map(|(name, (sum, count))| LossRow { step: *step, name, value: sum / count as f32 }));
-        }
-    }
-
     fn evaluate(&mut self) -> Result<Event> {
         let (step, episodes) = (self.progress.step, self.config.evaluation_episodes);
         let evaluation = self.evaluator.evaluate(&mut self.method, episodes, EvalSeeds::Training)?;
@@ -342,9 +205,7 @@ impl<E: Env> Run<E> {
         if !complete {
             return Ok(Event::Testing(test.results.len()));
         }
-        let rows = test.results.iter().enumerate();
-        let rows = rows.map(|(i, episode)| (i + 1, episode));
-        write_csv(&self.folder.join("test.csv"), &TEST_COLUMNS, rows)?;
+        records::write_test(&self.folder, test)?;
         let summary = toml::to_string(&test.summary()).expect("a summary is TOML");
         files::write(&self.folder.join("summary.toml"), summary.as_bytes())?;
         Ok(Event::Tested(test.clone()))
@@ -368,26 +229,9 @@ impl<E: Env> Run<E> {
         if self.config.learns() {
             weights.write(&self.folder.join("weights.safetensors"))?;
         }
-        let Progress { episodes, evaluations, losses, model, values, .. } = &self.progress;
-        if !model.is_empty() {
-            let rows = model.iter().map(|row| (row.step, &row.open_loop));
-            write_csv(&self.folder.join("model.csv"), &MODEL_COLUMNS, rows)?;
-        }
-        if !values.is_empty() {
-            write_csv(&self.folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
-        }
-        write_csv(&self.folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
-        write_csv(&self.folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations.iter())?;
-        write_csv(&self.folder.join("losses.csv"), &["step", "name", "value"], losses.iter())
+        self.progress.write_tables(&self.folder)
     }
 }
-
-const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "length", "seconds"];
-const EVALUATION_COLUMNS: [&str; 8] =
-    ["step", "episodes", "success", "return_mean", "return_std", "smoothness_sparc", "smoothness_ldlj", "action_ms"];
-const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90", "rmse_p90"];
-const VALUE_COLUMNS: [&str; 5] = ["step", "expected", "realised", "rmse", "correlation"];
-const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
 
 /// Whether the run in `folder` is complete.
 pub fn is_complete(folder: &Path) -> bool {
@@ -427,18 +271,10 @@ fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Optio
     }
 }
 
-fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
-    let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
-    let composed =
-        writer.write_record(columns).and_then(|()| rows.into_iter().try_for_each(|row| writer.serialize(row)));
-    composed.map_err(|problem| Error::bad_file(path, problem))?;
-    let bytes = writer.into_inner().map_err(|problem| Error::bad_file(path, problem))?;
-    files::write(path, &bytes)
-}
-
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use crate::model::open_loop::OpenLoop;
+    use crate::study::records::{LossRow, ModelRow};
     use crate::study::registry::Registry;
 
     #[test]

@@ -1,9 +1,12 @@
-//! `lift`: take the cube from the table. robosuite's Lift, with its numbers.
+//! `lift`: grasp the cube and lift it. robosuite's Lift, with its numbers.
 
-use super::task::{
-    HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView, closeness, gripper_features, gripper_values,
-    object_features, object_state_of, object_values, on_table, towards, vector, way,
+use nalgebra::Vector3;
+
+use super::helpers::{
+    GRIPPER, action_to_grasp, action_towards, difference_features, grasped, gripper_features, gripper_values,
+    object_features, object_values, pose_on_table, reaching_reward, robosuite_object_state, vector_at,
 };
+use super::task::{Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
 use crate::env::arm::Primitive;
 use crate::env::physics::{Physics, TABLE_TOP};
@@ -12,16 +15,15 @@ use crate::rng::{Rng, uniform};
 
 /// Height of the cube's centre above the table that counts as lifted, m.
 pub(super) const LIFTED: f64 = 0.04;
-pub(super) const GRIPPER: usize = HAND_VELOCITY.end;
-pub(super) const PADS: usize = GRIPPER + 2;
-pub(super) const CUBE: usize = GRIPPER + 4;
+pub(super) const CUBE: usize = GRIPPER.end;
 const HAND_TO_CUBE: usize = CUBE + 12;
 
-/// The task. See the module's page.
+/// Grasp the cube and lift it 4 cm off the table: robosuite's Lift, with its numbers (but see [`TableTask::horizon`]).
+#[derive(Clone, Copy, Debug)]
 pub struct Lift;
 
 impl TableTask for Lift {
-    fn name(&self) -> &'static str {
+    fn name(&self) -> &str {
         "lift"
     }
 
@@ -31,8 +33,8 @@ impl TableTask for Lift {
         200
     }
 
-    fn stages(&self) -> &'static [&'static str] {
-        &["reached", "grasped", "lifted"]
+    fn stages(&self) -> Vec<String> {
+        ["reached", "grasped", "lifted"].map(String::from).into()
     }
 
     fn uses_gripper(&self) -> bool {
@@ -41,12 +43,12 @@ impl TableTask for Lift {
 
     fn place(&self, physics: &mut Physics, rng: &mut Rng) -> Setup {
         let half = [0; 3].map(|_| uniform(rng, 0.020, 0.022));
-        let pose = on_table(rng, 0.03, half[2], 0.01);
+        let pose = pose_on_table(rng, 0.03, half[2], 0.01);
         Setup { objects: vec![physics.add_box(half, 1000.0, 1.0, &pose)], goal: None }
     }
 
     fn features(&self) -> Vec<Feature> {
-        [gripper_features(), object_features("cube"), way("hand", "cube").collect()].concat()
+        [gripper_features(), object_features("cube"), difference_features("hand", "cube").collect()].concat()
     }
 
     fn observe(&self, view: &TaskView) -> Vec<f64> {
@@ -55,15 +57,15 @@ impl TableTask for Lift {
         [gripper_values(view, 0), cube, way].concat()
     }
 
-    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
-        object_state_of(view, 0, "cube", "gripper_to_cube_pos")
+    fn object_state(&self, view: &TaskView) -> Option<Vec<(String, f64)>> {
+        Some(robosuite_object_state(view, 0, "cube", "gripper_to_cube_pos"))
     }
 
     fn outcome(&self, obs: &[f32]) -> TaskOutcome {
-        let distance = vector(obs, HAND_TO_CUBE).norm();
+        let distance = vector_at(obs, HAND_TO_CUBE).norm();
         let grasped = grasped(obs);
-        let success = vector(obs, CUBE).z > TABLE_TOP + LIFTED;
-        let shaped = if success { 2.25 } else { closeness(distance) + if grasped { 0.25 } else { 0.0 } };
+        let success = vector_at(obs, CUBE).z > TABLE_TOP + LIFTED;
+        let shaped = if success { 2.25 } else { reaching_reward(distance) + if grasped { 0.25 } else { 0.0 } };
         TaskOutcome {
             shaped: shaped / 2.25,
             success,
@@ -77,34 +79,17 @@ impl TableTask for Lift {
         }
     }
 
-    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
-        if grasped(obs) {
+    fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {
+        Some(if grasped(obs) {
             // Up, and then hold still.
-            let height = TABLE_TOP + 0.12 - vector(obs, CUBE).z;
-            return towards(nalgebra::Vector3::z() * height, 1.0);
-        }
-        descend_and_close(vector(obs, HAND_TO_CUBE))
+            let height = TABLE_TOP + 0.12 - vector_at(obs, CUBE).z;
+            action_towards(Vector3::z() * height, 1.0)
+        } else {
+            action_to_grasp(vector_at(obs, HAND_TO_CUBE))
+        })
     }
 
     fn drawn(&self, _setup: &Setup) -> Vec<Body> {
         vec![Body::solid("cube", "#d8443c", vec![Primitive::cuboid([0.021; 3], [0.0; 3])])]
-    }
-}
-
-/// Whether both pads touch the object. (Learned models answer with numbers between 0 and 1.)
-pub(super) fn grasped(obs: &[f32]) -> bool {
-    obs[PADS] > 0.5 && obs[PADS + 1] > 0.5
-}
-
-/// The first half of every scripted grasp: over the object, down to it, close.
-pub(super) fn descend_and_close(way: nalgebra::Vector3<f64>) -> [f64; 4] {
-    let aside = way.xy().norm();
-    if aside > 0.02 {
-        // Approach a few centimetres above the object, so that the fingers do not knock it over.
-        towards(way + nalgebra::Vector3::z() * 0.06, -1.0)
-    } else if way.norm() > 0.012 {
-        towards(way, -1.0)
-    } else {
-        towards(way, 1.0)
     }
 }

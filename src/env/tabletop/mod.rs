@@ -1,31 +1,83 @@
-//! Tasks for the arm at the table.
+//! Tasks for a robot arm at a table, in the manner of robosuite.
 //!
-//! [`Tabletop`] is the environment: arm, controller, gripper, observation. A [`TableTask`] is what
-//! differs from task to task: what stands on the table, what of it is observed, and what counts as
-//! success. A new task is one file like `reach.rs`, and one line in [`super::Task`].
+//! [`Tabletop`] is the environment: arm, controller, gripper, observation. A [`TableTask`] is what differs from task to
+//! task: what stands on the table, what of it is observed, and what counts as success. A task of your own is an
+//! `impl TableTask`, and everything that takes one of ours takes it too: planners on the true dynamics, known rewards,
+//! the scripted policy, the 3D replay. [`helpers`] has what ours are made of.
+//!
+//! ```
+//! use handful::env::physics::Physics;
+//! use handful::env::scene::Body;
+//! use handful::env::tabletop::helpers::{action_towards, difference_features, vector_at, xyz_features};
+//! use handful::env::tabletop::{Setup, TableTask, TaskOutcome, TaskView, Tabletop};
+//! use handful::nalgebra::Vector3;
+//! use handful::prelude::*;
+//! use handful::rng::Rng;
+//!
+//! /// Bring the hand 10 cm above the middle of the table.
+//! struct Hover;
+//!
+//! impl TableTask for Hover {
+//!     fn name(&self) -> &str { "hover" }
+//!     fn horizon(&self) -> usize { 50 }
+//!     fn place(&self, _physics: &mut Physics, _rng: &mut Rng) -> Setup {
+//!         Setup { objects: vec![], goal: Some(Vector3::new(0.0, 0.0, 0.9)) }
+//!     }
+//!     fn features(&self) -> Vec<Feature> {
+//!         let goal = xyz_features("goal", [0.0, 0.0, 0.9], 0.15).map(Feature::constant);
+//!         goal.chain(difference_features("hand", "goal")).collect()
+//!     }
+//!     fn observe(&self, view: &TaskView) -> Vec<f64> {
+//!         let goal = view.setup.goal.expect("hover has one");
+//!         goal.iter().chain(&(goal - view.hand.translation.vector)).copied().collect()
+//!     }
+//!     fn outcome(&self, obs: &[f32]) -> TaskOutcome {
+//!         let distance = vector_at(obs, 9).norm();
+//!         TaskOutcome { shaped: (1.0 - distance).max(0.0), success: distance < 0.02, stage: 0 }
+//!     }
+//!     fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> { Some(action_towards(vector_at(obs, 9), 0.0)) }
+//!     fn drawn(&self, _setup: &Setup) -> Vec<Body> { vec![Body::goal(0.02)] }
+//! }
+//!
+//! let mut env = Tabletop::new(Hover, TableOptions::default())?;
+//! let mut obs = env.reset(0);
+//! let last = loop {
+//!     let step = env.step(&env.scripted_action(&obs).expect("hover has a script"))?;
+//!     if step.done() { break step; }
+//!     obs = step.observation;
+//! };
+//! assert!(last.success);
+//! # Ok::<(), Error>(())
+//! ```
 
+mod build;
+mod drawing;
+pub mod helpers;
 mod lift;
+mod options;
 mod push;
 mod reach;
 mod robosuite;
 mod stack;
 mod task;
 
+use std::sync::Arc;
+
 use nalgebra::{UnitQuaternion, Vector3};
-use serde::{Deserialize, Serialize};
 
 pub use lift::Lift;
+pub use options::{ActionKind, ObservationKind, RewardKind, TableOptions};
 pub use push::Push;
 pub use reach::Reach;
 pub use stack::Stack;
 pub use task::{HAND_POSITION, HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView};
 
-use super::arm::{ArmDescription, JointVector, Pose};
+use super::arm::{JointVector, Pose};
 use super::kinematics::Kinematics;
 use super::osc::{Goal, OperationalSpaceController};
-use super::physics::{CONTROL_HZ, JointState, Physics, STEPS_PER_CONTROL, TABLE_HALF, TABLE_TOP, TIMESTEP};
+use super::physics::{JointState, Physics, STEPS_PER_CONTROL, TIMESTEP};
 use super::scene::{Body, Camera};
-use super::{Env, Feature, KnownReward, Snapshot, Spec, Step, arm::Primitive};
+use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::Result;
 use crate::rng;
 
@@ -34,69 +86,21 @@ const MAX_LEAD: f64 = 0.05;
 /// The same for a full rotation of the pose action, rad.
 const MAX_TURN: f64 = 0.5;
 
-/// What an episode is rewarded with.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum RewardKind {
-    /// A number in [0, 1] that grows along the way to success.
-    #[default]
-    Shaped,
-    /// 1 at success, else 0.
-    Sparse,
-}
-
-/// What an action means.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ActionKind {
-    /// `[dx, dy, dz, gripper]`; the hand keeps its home orientation. The gripper closes with a
-    /// speed proportional to the fourth number, so that a policy can learn it by gradient.
-    #[default]
-    Hand,
-    /// robosuite's `[dx, dy, dz, rx, ry, rz, gripper]`: also a rotation vector, in the world frame;
-    /// only the sign of the last number counts.
-    Pose,
-}
-
-/// What an observation holds.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ObservationKind {
-    /// Hand, gripper, objects, goal, and the vectors between them.
-    #[default]
-    Compact,
-    /// robosuite 1.5's vector: the task's object state, then 50 numbers of the robot. Rewards cannot
-    /// be computed from it alone (it does not tell what the pads touch).
-    Robosuite,
-}
-
-/// Options of every table task.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TableOptions {
-    /// Shaped or sparse reward.
-    pub reward: RewardKind,
-    /// What an action means.
-    pub action: ActionKind,
-    /// What an observation holds.
-    pub observation: ObservationKind,
-    /// Control steps in an episode; the task's own number if absent.
-    pub horizon: Option<usize>,
-}
-
 /// The arm at the table, with a task.
 pub struct Tabletop {
     spec: Spec,
     options: TableOptions,
-    task: &'static dyn TableTask,
+    task: Arc<dyn TableTask>,
+    /// Whether the task has a hand-written policy.
+    scripted: bool,
     /// Arm and bare table, ready to be copied for a new episode.
     empty: Physics,
     home_orientation: UnitQuaternion<f64>,
     state: TabletopState,
 }
 
-/// All that the future of an episode depends on.
-#[derive(Clone)]
+/// Everything that the rest of an episode depends on.
+#[derive(Clone, Debug)]
 pub struct TabletopState {
     physics: Physics,
     setup: Setup,
@@ -104,7 +108,7 @@ pub struct TabletopState {
     /// Kinematics at the start of the last physics step. robosuite sets its goals from these, one
     /// physics step old; so do we.
     measured: Kinematics,
-    /// Joint velocities at that moment, rad/s.
+    /// Joint velocities at that time, rad/s.
     measured_qd: JointVector,
     /// Where the finger servos are told to go, m, for each finger.
     finger_target: f64,
@@ -113,62 +117,35 @@ pub struct TabletopState {
 }
 
 impl Tabletop {
-    /// The Panda at the table with `task`.
-    pub fn new(task: &'static dyn TableTask, options: TableOptions) -> Self {
-        let arm = ArmDescription::panda();
-        let empty = Physics::new(arm.clone());
-        let home = empty.kinematics(&arm.home);
-        let goal = Goal { position: home.grip.translation.vector, orientation: home.grip.rotation };
-        let state = TabletopState {
-            controller: OperationalSpaceController::new(&arm, goal, arm.home),
-            setup: Setup::default(),
-            measured: home,
-            measured_qd: JointVector::zeros(),
-            finger_target: 0.0,
-            elapsed: 0,
-            compact: Vec::new(),
-            physics: empty.clone(),
-        };
-        let action_size = match options.action {
-            ActionKind::Hand => 4,
-            ActionKind::Pose => 7,
-        };
-        let horizon = options.horizon.unwrap_or(task.horizon());
-        let mut tabletop = Self {
-            spec: Spec::new(task.name(), [], action_size, horizon, 1.0 / CONTROL_HZ)
-                .stages(task.stages().iter().copied()),
-            home_orientation: goal.orientation,
-            options,
-            task,
-            empty,
-            state,
-        };
-        tabletop.spec.observation = match options.observation {
-            ObservationKind::Compact => {
-                let hand = [("hand x", -0.1), ("hand y", 0.0), ("hand z", 0.95)]
-                    .map(|(name, centre)| Feature::new(name).around(centre, 0.15));
-                let velocity = ["hand vx", "hand vy", "hand vz"].map(|name| Feature::new(name).around(0.0, 0.2));
-                hand.into_iter().chain(velocity).chain(task.features()).collect()
-            }
-            ObservationKind::Robosuite => {
-                tabletop.reset(0);
-                robosuite::observe(&tabletop).into_iter().map(|(name, _)| Feature::new(name)).collect()
-            }
-        };
-        tabletop
-    }
-
-    /// The world under the task.
+    /// The simulation under the task.
     pub fn physics(&self) -> &Physics {
         &self.state.physics
     }
 
-    /// What stands on the table.
+    /// The objects and the goal of this episode.
     pub fn setup(&self) -> &Setup {
         &self.state.setup
     }
 
-    /// The compact observation, whichever kind the agent is given.
+    /// The action of the task's hand-written policy for an observation. None if the task has no such policy, or if
+    /// observations are not compact.
+    pub fn scripted_action(&self, obs: &[f32]) -> Option<Vec<f32>> {
+        self.observes_compact().then(|| self.task.scripted(obs))?.map(|hand| self.options.action_of_hand(hand))
+    }
+
+    /// The task's hand-written policy, from observations to actions, apart from the environment. None if
+    /// [`Tabletop::scripted_action`] has nothing to say; an observation without a scripted action is answered with zeros.
+    pub fn scripted_policy(&self) -> Option<impl Fn(&[f32]) -> Vec<f32> + Send + Sync + use<>> {
+        let (task, options) = (self.task.clone(), self.options);
+        (self.scripted && self.observes_compact())
+            .then(|| move |obs: &[f32]| options.action_of_hand(task.scripted(obs).unwrap_or_default()))
+    }
+
+    fn observes_compact(&self) -> bool {
+        self.options.observation == ObservationKind::Compact
+    }
+
+    /// The compact observation at this time step, whichever kind the agent is given.
     pub fn compact(&self) -> &[f32] {
         &self.state.compact
     }
@@ -187,15 +164,22 @@ impl Tabletop {
         })
     }
 
-    fn observe(&mut self) -> Vec<f32> {
-        self.state.compact = self.with_view(|view| {
+    fn compact_observation(&self) -> Vec<f32> {
+        self.with_view(|view| {
             let hand = view.hand.translation.vector;
             let common = hand.iter().chain(&view.hand_velocity).copied();
             common.chain(self.task.observe(view)).map(|x| x as f32).collect()
-        });
+        })
+    }
+
+    fn observe(&mut self) -> Vec<f32> {
+        self.state.compact = self.compact_observation();
         match self.options.observation {
             ObservationKind::Compact => self.state.compact.clone(),
-            ObservationKind::Robosuite => robosuite::observe(self).into_iter().map(|(_, value)| value as f32).collect(),
+            ObservationKind::Robosuite => {
+                let values = robosuite::observe(self).expect("checked when it was made");
+                values.into_iter().map(|(_, value)| value as f32).collect()
+            }
         }
     }
 
@@ -289,33 +273,11 @@ impl Env for Tabletop {
     }
 
     fn scene(&self) -> Vec<Body> {
-        let arm = self.state.physics.arm();
-        let (white, dark) = ("#e8ebf0", "#39424e");
-        let mut bodies = vec![Body::solid("base", dark, arm.base_shapes.clone())];
-        for (i, link) in arm.links.iter().enumerate() {
-            bodies.push(Body::solid(format!("link {}", i + 1), white, link.shapes.clone()));
-        }
-        for side in [1.0, -1.0] {
-            let shapes = [&arm.gripper.finger, &arm.gripper.pad].map(|shape| arm.gripper.on_side(shape, side));
-            bodies.push(Body::solid("finger", dark, shapes.to_vec()));
-        }
-        // The point that is controlled: small, but its trail shows the path.
-        bodies.push(Body::solid("hand", "#f2a33a", vec![Primitive::ball(0.004, [0.0; 3])]));
-        let legs = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)]
-            .map(|(x, y)| Primitive::cuboid([0.02, 0.02, 0.3875], [0.37 * x, 0.37 * y, -0.4125]));
-        let table = std::iter::once(Primitive::cuboid(TABLE_HALF, [0.0; 3])).chain(legs).collect();
-        bodies.push(Body::solid("table", "#c9a97c", table));
-        bodies.extend(self.task.drawn(&self.state.setup));
-        bodies
+        drawing::bodies(self)
     }
 
     fn poses(&self) -> Vec<Pose> {
-        let state = &self.state;
-        let hand = state.physics.kinematics(&state.physics.joint_state().q).grip;
-        let table = Pose::translation(0.0, 0.0, TABLE_TOP - TABLE_HALF[2]);
-        let objects = state.setup.objects.iter().map(|&object| state.physics.object_state(object).pose);
-        let goal = state.setup.goal.map(|goal| Pose::translation(goal.x, goal.y, goal.z));
-        state.physics.arm_poses().chain([hand, table]).chain(objects).chain(goal).collect()
+        drawing::poses(self)
     }
 
     fn camera(&self) -> Camera {
@@ -324,17 +286,33 @@ impl Env for Tabletop {
 
     /// The hand, if observations are compact.
     fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
-        let compact = self.options.observation == ObservationKind::Compact;
-        compact.then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
+        self.observes_compact()
+            .then(|| HAND_POSITION.map(|i| f64::from(obs[i])).collect::<Vec<_>>().try_into().expect("three numbers"))
     }
 }
 
 impl KnownReward for Tabletop {
+    /// With compact observations; [`ObservationKind::Robosuite`] does not determine the reward.
+    fn is_known(&self) -> bool {
+        self.observes_compact()
+    }
+
     /// # Panics
-    /// With [`ObservationKind::Robosuite`]: those observations do not determine the reward.
+    /// If the reward is not known ([`KnownReward::is_known`]).
     fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
-        assert_eq!(self.options.observation, ObservationKind::Compact, "the reward needs compact observations");
+        assert!(self.is_known(), "the reward needs compact observations");
         self.reward_of(self.task.outcome(next_obs))
+    }
+}
+
+impl std::fmt::Debug for Tabletop {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let Self { spec, options, state, .. } = self;
+        f.debug_struct("Tabletop")
+            .field("spec", spec)
+            .field("options", options)
+            .field("state", state)
+            .finish_non_exhaustive()
     }
 }
 

@@ -4,10 +4,11 @@
 
 use nalgebra::Vector3;
 
-use super::task::{
-    HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView, closeness, cube_features, named, object_state_of,
-    object_values, on_table, towards, vector, way, xyz,
+use super::helpers::{
+    action_towards, cube_features, difference_features, named_values, object_values, pose_on_table, reaching_reward,
+    robosuite_object_state, vector_at, xyz_features,
 };
+use super::task::{HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
 use crate::env::arm::Primitive;
 use crate::env::physics::{Physics, TABLE_TOP};
@@ -27,11 +28,13 @@ const HAND_TO_CUBE: usize = CUBE + 12;
 const GOAL: usize = HAND_TO_CUBE + 3;
 const CUBE_TO_GOAL: usize = GOAL + 3;
 
-/// The task. See the module's page.
+/// Push the cube to a goal on the table with closed fingers. Cube and goal are uniform in a square of 0.3 m, at least 0.1 m
+/// apart; success is the cube within 5 cm of the goal.
+#[derive(Clone, Copy, Debug)]
 pub struct Push;
 
 impl TableTask for Push {
-    fn name(&self) -> &'static str {
+    fn name(&self) -> &str {
         "push"
     }
 
@@ -39,17 +42,13 @@ impl TableTask for Push {
         150
     }
 
-    fn stages(&self) -> &'static [&'static str] {
-        &["reached", "pushed"]
-    }
-
-    fn uses_gripper(&self) -> bool {
-        false
+    fn stages(&self) -> Vec<String> {
+        ["reached", "pushed"].map(String::from).into()
     }
 
     fn place(&self, physics: &mut Physics, rng: &mut Rng) -> Setup {
         physics.set_table_friction(FRICTION);
-        let pose = on_table(rng, REACH, HALF, 0.0);
+        let pose = pose_on_table(rng, REACH, HALF, 0.0);
         let cube = pose.translation.vector;
         let goal = loop {
             let goal = Vector3::new(uniform(rng, -REACH, REACH), uniform(rng, -REACH, REACH), cube.z);
@@ -63,9 +62,9 @@ impl TableTask for Push {
     fn features(&self) -> Vec<Feature> {
         let table = TABLE_TOP as f32;
         cube_features("cube")
-            .chain(way("hand", "cube"))
-            .chain(xyz("goal", [0.0, 0.0, table], 0.1).map(Feature::constant))
-            .chain(way("cube", "goal"))
+            .chain(difference_features("hand", "cube"))
+            .chain(xyz_features("goal", [0.0, 0.0, table], 0.1).map(Feature::constant))
+            .chain(difference_features("cube", "goal"))
             .collect()
     }
 
@@ -79,29 +78,30 @@ impl TableTask for Push {
         values
     }
 
-    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Option<Vec<(String, f64)>> {
         let goal = view.setup.goal.expect("push has a goal");
         let cube = view.physics.object_state(view.setup.objects[0]).pose.translation.vector;
-        let mut values = object_state_of(view, 0, "cube", "gripper_to_cube_pos");
-        values.extend(named("goal_pos", goal.iter()));
-        values.extend(named("cube_to_goal", (goal - cube).iter()));
-        values
+        let mut values = robosuite_object_state(view, 0, "cube", "gripper_to_cube_pos");
+        values.extend(named_values("goal_pos", goal.iter()));
+        values.extend(named_values("cube_to_goal", (goal - cube).iter()));
+        Some(values)
     }
 
     fn outcome(&self, obs: &[f32]) -> TaskOutcome {
-        let hand_to_cube = vector(obs, HAND_TO_CUBE).norm();
-        let cube_to_goal = vector(obs, CUBE_TO_GOAL).norm();
+        let hand_to_cube = vector_at(obs, HAND_TO_CUBE).norm();
+        let cube_to_goal = vector_at(obs, CUBE_TO_GOAL).norm();
         let success = cube_to_goal < TOLERANCE;
-        let shaped = if success { 1.0 } else { 0.25 * closeness(hand_to_cube) + 0.75 * closeness(cube_to_goal) };
+        let shaped =
+            if success { 1.0 } else { 0.25 * reaching_reward(hand_to_cube) + 0.75 * reaching_reward(cube_to_goal) };
         TaskOutcome { shaped, success, stage: if success { 2 } else { usize::from(hand_to_cube < 0.05) } }
     }
 
     /// Behind the cube as seen from the goal, down, and through it towards the goal.
-    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
-        let to_cube = vector(obs, HAND_TO_CUBE);
-        let to_goal = vector(obs, CUBE_TO_GOAL).xy();
+    fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {
+        let to_cube = vector_at(obs, HAND_TO_CUBE);
+        let to_goal = vector_at(obs, CUBE_TO_GOAL).xy();
         if to_goal.norm() < 0.015 {
-            return towards(Vector3::zeros(), 0.0);
+            return Some(action_towards(Vector3::zeros(), 0.0));
         }
         let ahead = to_goal.normalize();
         let behind = to_cube - Vector3::new(ahead.x, ahead.y, 0.0) * 0.06;
@@ -110,16 +110,16 @@ impl TableTask for Push {
         let back = to_cube.xy().dot(&ahead);
         let aside = (to_cube.xy() - ahead * back).norm();
         let low = height > -0.03;
-        if low && back > 0.01 && aside < 0.012 {
+        Some(if low && back > 0.01 && aside < 0.012 {
             let step = to_cube.xy() - ahead * back + ahead * to_goal.norm().min(0.05);
-            towards(Vector3::new(step.x, step.y, height), 0.0)
+            action_towards(Vector3::new(step.x, step.y, height), 0.0)
         } else if behind.xy().norm() > 0.012 {
             // Travel above the cube's height.
             let clear = if behind.xy().norm() < 0.03 { height } else { height + 0.07 };
-            towards(Vector3::new(behind.x, behind.y, clear), 0.0)
+            action_towards(Vector3::new(behind.x, behind.y, clear), 0.0)
         } else {
-            towards(Vector3::new(behind.x, behind.y, height), 0.0)
-        }
+            action_towards(Vector3::new(behind.x, behind.y, height), 0.0)
+        })
     }
 
     fn drawn(&self, _setup: &Setup) -> Vec<Body> {

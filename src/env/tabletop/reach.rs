@@ -4,9 +4,8 @@
 
 use nalgebra::Vector3;
 
-use super::task::{
-    HAND_POSITION, Setup, TableTask, TaskOutcome, TaskView, closeness, named, towards, vector, way, xyz,
-};
+use super::helpers::{action_towards, difference_features, named_values, reaching_reward, vector_at, xyz_features};
+use super::task::{HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
 use crate::env::physics::Physics;
 use crate::env::scene::Body;
@@ -14,14 +13,16 @@ use crate::rng::{Rng, uniform};
 
 /// Distance that counts as there, m.
 const TOLERANCE: f64 = 0.02;
-const GOAL: usize = HAND_POSITION.end + 3;
+const GOAL: usize = HAND_VELOCITY.end;
 const HAND_TO_GOAL: usize = GOAL + 3;
 
-/// The task. See the module's page.
+/// Bring the hand to a goal in the air, uniform in a box of 0.3 x 0.4 x 0.3 m above the table; success is the hand within
+/// 2 cm of it.
+#[derive(Clone, Copy, Debug)]
 pub struct Reach;
 
 impl TableTask for Reach {
-    fn name(&self) -> &'static str {
+    fn name(&self) -> &str {
         "reach"
     }
 
@@ -29,12 +30,8 @@ impl TableTask for Reach {
         100
     }
 
-    fn stages(&self) -> &'static [&'static str] {
-        &["within 5 cm", "reached"]
-    }
-
-    fn uses_gripper(&self) -> bool {
-        false
+    fn stages(&self) -> Vec<String> {
+        ["within 5 cm", "reached"].map(String::from).into()
     }
 
     fn place(&self, _physics: &mut Physics, rng: &mut Rng) -> Setup {
@@ -43,7 +40,10 @@ impl TableTask for Reach {
     }
 
     fn features(&self) -> Vec<Feature> {
-        xyz("goal", [0.0, 0.0, 1.0], 0.15).map(Feature::constant).chain(way("hand", "goal")).collect()
+        xyz_features("goal", [0.0, 0.0, 1.0], 0.15)
+            .map(Feature::constant)
+            .chain(difference_features("hand", "goal"))
+            .collect()
     }
 
     fn observe(&self, view: &TaskView) -> Vec<f64> {
@@ -52,23 +52,23 @@ impl TableTask for Reach {
         goal.iter().chain(&way).copied().collect()
     }
 
-    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Option<Vec<(String, f64)>> {
         let goal = view.setup.goal.expect("reach has a goal");
         let way = goal - view.hand.translation.vector;
-        [named("goal_pos", goal.iter()), named("gripper_to_goal", way.iter())].concat()
+        Some([named_values("goal_pos", goal.iter()), named_values("gripper_to_goal", way.iter())].concat())
     }
 
     fn outcome(&self, obs: &[f32]) -> TaskOutcome {
-        let distance = vector(obs, HAND_TO_GOAL).norm();
+        let distance = vector_at(obs, HAND_TO_GOAL).norm();
         TaskOutcome {
-            shaped: closeness(distance),
+            shaped: reaching_reward(distance),
             success: distance < TOLERANCE,
             stage: usize::from(distance < 0.05) + usize::from(distance < TOLERANCE),
         }
     }
 
-    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
-        towards(vector(obs, HAND_TO_GOAL), 0.0)
+    fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {
+        Some(action_towards(vector_at(obs, HAND_TO_GOAL), 0.0))
     }
 
     fn drawn(&self, _setup: &Setup) -> Vec<Body> {

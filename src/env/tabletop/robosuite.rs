@@ -3,10 +3,10 @@
 use nalgebra::{UnitQuaternion, Vector3};
 
 use super::Tabletop;
-use super::task::named;
+use super::helpers::named_values;
 
-/// Names and values, in robosuite's order.
-pub(super) fn observe(tabletop: &Tabletop) -> Vec<(String, f64)> {
+/// Names and values, in robosuite's order. None if the task gives no object state.
+pub(super) fn observe(tabletop: &Tabletop) -> Option<Vec<(String, f64)>> {
     tabletop.with_view(|view| {
         let joints = view.joints;
         // robosuite reports the hand body's orientation beside the grip site's: they differ by a
@@ -15,7 +15,7 @@ pub(super) fn observe(tabletop: &Tabletop) -> Vec<(String, f64)> {
         let hand_body = view.hand.rotation * quarter;
         let [left, right] = joints.fingers;
         let [left_v, right_v] = joints.finger_velocities;
-        let mut values = tabletop.task.object_state(view);
+        let mut values = tabletop.task.object_state(view)?;
         for (name, part) in [
             ("joint_pos", joints.q),
             ("joint_pos_cos", joints.q.map(f64::cos)),
@@ -23,13 +23,13 @@ pub(super) fn observe(tabletop: &Tabletop) -> Vec<(String, f64)> {
             ("joint_vel", joints.qd),
             ("joint_acc", tabletop.joint_acceleration(joints)),
         ] {
-            values.extend(named(name, part.iter()));
+            values.extend(named_values(name, part.iter()));
         }
-        values.extend(named("eef_pos", view.hand.translation.vector.iter()));
-        values.extend(named("eef_quat", hand_body.coords.iter()));
-        values.extend(named("eef_quat_site", view.hand.rotation.coords.iter()));
-        values.extend(named("gripper_qpos", [left, -right].iter()));
-        values.extend(named("gripper_qvel", [left_v, -right_v].iter()));
-        values
+        values.extend(named_values("eef_pos", view.hand.translation.vector.iter()));
+        values.extend(named_values("eef_quat", hand_body.coords.iter()));
+        values.extend(named_values("eef_quat_site", view.hand.rotation.coords.iter()));
+        values.extend(named_values("gripper_qpos", [left, -right].iter()));
+        values.extend(named_values("gripper_qvel", [left_v, -right_v].iter()));
+        Some(values)
     })
 }

@@ -2,11 +2,12 @@
 
 use nalgebra::Vector3;
 
-use super::lift::{CUBE, LIFTED, descend_and_close, grasped};
-use super::task::{
-    Setup, TableTask, TaskOutcome, TaskView, closeness, cube_features, gripper_features, gripper_values, named,
-    object_state_of, object_values, on_table, towards, vector, way,
+use super::helpers::{
+    GRIPPER, action_to_grasp, action_towards, cube_features, difference_features, grasped, gripper_features,
+    gripper_values, named_values, object_values, pose_on_table, reaching_reward, robosuite_object_state, vector_at,
 };
+use super::lift::{CUBE, LIFTED};
+use super::task::{Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
 use crate::env::arm::Primitive;
 use crate::env::physics::{Physics, TABLE_TOP};
@@ -22,11 +23,12 @@ const HAND_TO_CUBE: usize = BASE + 12;
 const CUBE_TO_BASE: usize = HAND_TO_CUBE + 3;
 const TOUCHING: usize = CUBE_TO_BASE + 3;
 
-/// The task. See the module's page.
+/// Put the red cube on the green one: robosuite's Stack, with its numbers.
+#[derive(Clone, Copy, Debug)]
 pub struct Stack;
 
 impl TableTask for Stack {
-    fn name(&self) -> &'static str {
+    fn name(&self) -> &str {
         "stack"
     }
 
@@ -34,8 +36,8 @@ impl TableTask for Stack {
         300
     }
 
-    fn stages(&self) -> &'static [&'static str] {
-        &["reached", "grasped", "lifted", "stacked"]
+    fn stages(&self) -> Vec<String> {
+        ["reached", "grasped", "lifted", "stacked"].map(String::from).into()
     }
 
     fn uses_gripper(&self) -> bool {
@@ -44,9 +46,9 @@ impl TableTask for Stack {
 
     fn place(&self, physics: &mut Physics, rng: &mut Rng) -> Setup {
         let apart = (HALF[0] + HALF[1]) * std::f64::consts::SQRT_2;
-        let base = on_table(rng, REACH, HALF[1], 0.01);
+        let base = pose_on_table(rng, REACH, HALF[1], 0.01);
         let cube = loop {
-            let cube = on_table(rng, REACH, HALF[0], 0.01);
+            let cube = pose_on_table(rng, REACH, HALF[0], 0.01);
             if (cube.translation.vector - base.translation.vector).xy().norm() > apart {
                 break cube;
             }
@@ -61,8 +63,8 @@ impl TableTask for Stack {
             .into_iter()
             .chain(cube_features("cube"))
             .chain(cube_features("base"))
-            .chain(way("hand", "cube"))
-            .chain(way("cube", "base"))
+            .chain(difference_features("hand", "cube"))
+            .chain(difference_features("cube", "base"))
             .chain([Feature::new("cube touches base").around(0.5, 0.5)])
             .collect()
     }
@@ -76,22 +78,22 @@ impl TableTask for Stack {
         [gripper_values(view, 0), cube, base, to_cube, to_base, vec![f64::from(touching)]].concat()
     }
 
-    fn object_state(&self, view: &TaskView) -> Vec<(String, f64)> {
+    fn object_state(&self, view: &TaskView) -> Option<Vec<(String, f64)>> {
         let [cube, base] = [0, 1].map(|i| view.physics.object_state(view.setup.objects[i]).pose.translation.vector);
-        let a = object_state_of(view, 0, "cubeA", "gripper_to_cubeA");
-        let b = object_state_of(view, 1, "cubeB", "gripper_to_cubeB");
+        let a = robosuite_object_state(view, 0, "cubeA", "gripper_to_cubeA");
+        let b = robosuite_object_state(view, 1, "cubeB", "gripper_to_cubeB");
         // robosuite lists both poses first, then the vectors between things.
-        [&a[..7], &b[..7], &named("cubeA_to_cubeB", (base - cube).iter()), &a[7..], &b[7..]].concat()
+        Some([&a[..7], &b[..7], &named_values("cubeA_to_cubeB", (base - cube).iter()), &a[7..], &b[7..]].concat())
     }
 
     fn outcome(&self, obs: &[f32]) -> TaskOutcome {
-        let distance = vector(obs, HAND_TO_CUBE).norm();
+        let distance = vector_at(obs, HAND_TO_CUBE).norm();
         let grasped = grasped(obs);
-        let lifted = vector(obs, CUBE).z > TABLE_TOP + LIFTED;
+        let lifted = vector_at(obs, CUBE).z > TABLE_TOP + LIFTED;
         let stacked = !grasped && lifted && obs[TOUCHING] > 0.5;
-        let reach = 0.25 * closeness(distance) + if grasped { 0.25 } else { 0.0 };
+        let reach = 0.25 * reaching_reward(distance) + if grasped { 0.25 } else { 0.0 };
         // robosuite leaves the factor 10 out of this distance; the term is nearly flat.
-        let align = 0.5 * (1.0 - vector(obs, CUBE_TO_BASE).xy().norm().tanh());
+        let align = 0.5 * (1.0 - vector_at(obs, CUBE_TO_BASE).xy().norm().tanh());
         let lift = if lifted { 1.0 + align } else { 0.0 };
         let stack = if stacked { 2.0 } else { 0.0 };
         TaskOutcome {
@@ -109,27 +111,27 @@ impl TableTask for Stack {
         }
     }
 
-    fn scripted(&self, obs: &[f32]) -> [f64; 4] {
-        let to_base = vector(obs, CUBE_TO_BASE);
+    fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {
+        let to_base = vector_at(obs, CUBE_TO_BASE);
         let on_top = HALF[0] + HALF[1];
         let over = to_base.xy().norm() < 0.01;
         if over && (to_base.z + on_top).abs() < 0.004 {
             // There: let go, and draw back once the fingers are open.
-            let open = obs[super::lift::GRIPPER] > 0.03;
-            return towards(Vector3::z() * if open { 0.05 } else { 0.0 }, -1.0);
+            let open = obs[GRIPPER.start] > 0.03;
+            return Some(action_towards(Vector3::z() * if open { 0.05 } else { 0.0 }, -1.0));
         }
         if grasped(obs) {
             let height = to_base.z + on_top;
             // Lift clear of the base, carry across, lower.
-            return if over {
-                towards(Vector3::new(to_base.x, to_base.y, height.max(-0.03)), 1.0)
+            return Some(if over {
+                action_towards(Vector3::new(to_base.x, to_base.y, height.max(-0.03)), 1.0)
             } else if height < -0.03 || to_base.xy().norm() < 0.03 {
-                towards(Vector3::new(to_base.x, to_base.y, height + 0.05), 1.0)
+                action_towards(Vector3::new(to_base.x, to_base.y, height + 0.05), 1.0)
             } else {
-                towards(Vector3::z() * (height + 0.05), 1.0)
-            };
+                action_towards(Vector3::z() * (height + 0.05), 1.0)
+            });
         }
-        descend_and_close(vector(obs, HAND_TO_CUBE))
+        Some(action_to_grasp(vector_at(obs, HAND_TO_CUBE)))
     }
 
     fn drawn(&self, _setup: &Setup) -> Vec<Body> {

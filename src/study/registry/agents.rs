@@ -28,10 +28,12 @@ impl AgentContext<'_> {
     }
 
     fn oracle(&self, config: OracleConfig) -> Result<Method> {
-        let make =
-            self.env.oracle.as_ref().ok_or_else(|| {
-                Error::BadSetting(format!("{} cannot be restored, and so has no oracle", self.env.name))
-            })?;
+        let make = self.env.oracle.as_ref().ok_or_else(|| {
+            Error::BadSetting(format!(
+                "{} has no oracle: it was not registered `with_oracle`, which needs `Snapshot`",
+                self.env.name
+            ))
+        })?;
         make(self.options, config, self.seed)
     }
 

@@ -32,9 +32,9 @@ pub use envs::{EnvEntry, NoOptions, Settings};
 use super::config::{RunConfig, bad_config, upgrade_keys};
 use super::run::Run;
 use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, merge, preset_table, specialise};
+use crate::checkpoint::Weights;
 use crate::env::Env;
 use crate::error::{Error, Result};
-use crate::checkpoint::Weights;
 
 /// Environments, agents and presets by name.
 pub struct Registry {

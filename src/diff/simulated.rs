@@ -1,13 +1,26 @@
-//! A differentiable simulator as an objective: every planner can then be asked about it, those by gradients too.
+//! A differentiable simulator as an objective of the planners in [`crate::plan`], those that use gradients included.
 
 use nalgebra::SVector;
 use rayon::prelude::*;
 
-use super::{ActionSequences, Objective};
-use crate::diff::derivatives::gradient;
-use crate::diff::{System, roll_out};
+use super::derivatives::gradient;
+use super::{System, roll_out};
+use crate::plan::{ActionSequences, Objective};
 
-/// What action sequences are worth in a [`System`]: the negative of what they cost.
+/// The return of action sequences in a [`System`]: the negative of their cost. Actions are clamped to [-1, 1].
+///
+/// ```
+/// use handful::diff::{PendulumSwing, Simulated};
+/// use handful::nalgebra::Vector2;
+/// use handful::plan::{ActionSequences, Objective};
+///
+/// let mut hanging = Simulated::new(&PendulumSwing, Vector2::new(std::f64::consts::PI, 0.0));
+/// // Two sequences of three actions: do nothing, and push.
+/// let sequences = ActionSequences { horizon: 3, actions: 1, values: vec![0.0, 0.0, 0.0, 1.0, 1.0, 1.0] };
+/// let (returns, gradients) = hanging.gradients(&sequences);
+/// assert_eq!((returns.len(), gradients.len()), (2, 6));
+/// ```
+#[derive(Clone, Debug)]
 pub struct Simulated<'a, Y, const N: usize, const M: usize> {
     system: &'a Y,
     start: SVector<f64, N>,
@@ -16,7 +29,7 @@ pub struct Simulated<'a, Y, const N: usize, const M: usize> {
 }
 
 impl<'a, Y: System<N, M>, const N: usize, const M: usize> Simulated<'a, Y, N, M> {
-    /// From this state on.
+    /// Roll-outs of `system` from `start`.
     pub fn new(system: &'a Y, start: SVector<f64, N>) -> Self {
         Self { system, start, steps: 0 }
     }

@@ -1,0 +1,98 @@
+//! A physics step: motor torques, dry friction in the joints, and rapier's solver.
+
+use rapier3d::math::Vector;
+use rapier3d::prelude::*;
+
+use super::{JointState, Physics, SIDES, TIMESTEP};
+use crate::env::arm::{GripperDescription, JOINTS, JointVector};
+
+/// Substeps of the solver in a physics step. A grasp needs more: the hand moves on arcs, a held
+/// object in straight lines from substep to substep, and the difference is slip.
+const SUBSTEPS: usize = 1;
+const SUBSTEPS_HOLDING: usize = 6;
+
+/// A joint limit counts as near at this distance, far more than a joint moves in one step: rad, m.
+const HINGE_MARGIN: f64 = 0.1;
+const SLIDE_MARGIN: f64 = 0.005;
+
+impl Physics {
+    /// Puts the arm at joint angles `q` (rad) and the fingers at `fingers` (m), at rest.
+    pub fn set_joints(&mut self, q: &JointVector, fingers: [f64; 2]) {
+        let now = self.joint_state();
+        let PhysicsWorld { bodies, multibody_joints, .. } = &mut self.world;
+        let (multibody, _) = multibody_joints.get_mut(self.joints[0]).expect("the arm is in the world");
+        let mut move_by = [0.0; JOINTS + 2];
+        for i in 0..JOINTS {
+            move_by[i] = (q[i] - now.q[i]) as f32;
+        }
+        for i in 0..2 {
+            move_by[JOINTS + i] = (fingers[i] - now.fingers[i]) as f32;
+        }
+        multibody.apply_displacements(&move_by);
+        multibody.generalized_velocity_mut().fill(0.0);
+        multibody.forward_kinematics(bodies, false);
+        multibody.update_rigid_bodies(bodies, true);
+    }
+
+    /// Advances by one [`TIMESTEP`] under joint torques (N m) and finger forces (N, positive opens).
+    pub fn step(&mut self, torques: &JointVector, finger_forces: [f64; 2]) {
+        let joints = self.joint_state();
+        self.watch_limits(&joints);
+        let arm = &self.arm;
+        let torques = JointVector::from_fn(|i, _| {
+            torques[i] - dry_friction(arm.links[i].friction, arm.links[i].armature, joints.qd[i], torques[i])
+        });
+        let finger_forces = [0, 1].map(|i| {
+            let GripperDescription { friction, armature, .. } = arm.gripper;
+            finger_forces[i] - dry_friction(friction, armature, joints.finger_velocities[i], finger_forces[i])
+        });
+        let bodies = &mut self.world.bodies;
+        let axes = self.links.map(|link| bodies[link].rotation() * Vector::Z);
+        // A motor turns its link and pushes back on the link before it.
+        for i in 0..JOINTS {
+            let own = axes[i] * torques[i] as f32;
+            let next = if i + 1 < JOINTS { axes[i + 1] * torques[i + 1] as f32 } else { Vector::ZERO };
+            let link = &mut bodies[self.links[i]];
+            link.reset_torques(true);
+            link.reset_forces(true);
+            link.add_torque(own - next, true);
+        }
+        for ((finger, side), force) in self.fingers.iter().zip(SIDES).zip(finger_forces) {
+            let finger = &mut bodies[*finger];
+            let push = finger.rotation() * Vector::Y * (side * force) as f32;
+            let at = finger.center_of_mass();
+            finger.reset_forces(true);
+            finger.add_force(push, true);
+            bodies[self.links[JOINTS - 1]].add_force_at_point(-push, at, true);
+        }
+        self.world.integration_parameters.num_solver_iterations =
+            if self.holding() { SUBSTEPS_HOLDING } else { SUBSTEPS };
+        self.world.step();
+    }
+
+    /// Whether a pad touches anything.
+    fn holding(&self) -> bool {
+        let mut pairs = self.pads.iter().flat_map(|&pad| self.world.narrow_phase.contact_pairs_with(pad));
+        pairs.any(|pair| pair.total_impulse_magnitude() > 0.0)
+    }
+
+    /// Tells the solver only of those joint limits that are near: each costs it a row in every
+    /// substep, however far away.
+    fn watch_limits(&mut self, joints: &JointState) {
+        let (multibody, _) = self.world.multibody_joints.get_mut(self.joints[0]).expect("the arm is in the world");
+        let hinges = self.arm.links.iter().zip(joints.q.iter());
+        let hinges = hinges.map(|(link, q)| (link.range, *q, HINGE_MARGIN, JointAxesMask::ANG_X));
+        let slides = joints.fingers.map(|q| (self.arm.gripper.range, q, SLIDE_MARGIN, JointAxesMask::LIN_X));
+        for (i, ([low, high], q, margin, axis)) in hinges.chain(slides).enumerate() {
+            let joint = &mut multibody.link_mut(i + 1).expect("a link for each joint").joint.data;
+            joint.limit_axes.set(axis, q - low < margin || high - q < margin);
+        }
+    }
+}
+
+/// Dry friction (N m or N) that a joint feels which moves at `velocity` under `force`: just what would
+/// stop it within the step, up to `friction`. With rotor inertias this large it is as good as a row of
+/// the solver, and cheaper.
+fn dry_friction(friction: f64, armature: f64, velocity: f64, force: f64) -> f64 {
+    (armature * velocity / TIMESTEP + force).clamp(-friction, friction)
+}

@@ -1,0 +1,190 @@
+//! What a run records: the rows of its CSV files.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::evaluate::{Evaluation, Summary};
+use super::statistics::{correlation, mean};
+use crate::agent::{Losses, ValueEstimate};
+use crate::error::{Error, Result};
+use crate::files;
+use crate::model::open_loop::OpenLoop;
+
+/// Losses are averaged over this many steps for `losses.csv`.
+const LOSSES_EVERY: usize = 500;
+
+const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "length", "seconds"];
+const EVALUATION_COLUMNS: [&str; 8] =
+    ["step", "episodes", "success", "return_mean", "return_std", "smoothness_sparc", "smoothness_ldlj", "action_ms"];
+const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90", "rmse_p90"];
+const VALUE_COLUMNS: [&str; 5] = ["step", "expected", "realised", "rmse", "correlation"];
+const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
+
+/// A row of `episodes.csv`: one training episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeRow {
+    /// Environment steps at its end.
+    pub step: usize,
+    /// Its number, from 1.
+    pub episode: usize,
+    /// Sum of rewards.
+    #[serde(rename = "return")]
+    pub total: f64,
+    /// Whether the task was fulfilled at its last step.
+    pub success: bool,
+    /// Steps in it.
+    pub length: usize,
+    /// Seconds of training at its end.
+    pub seconds: f64,
+}
+
+/// A row of `evaluations.csv`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EvaluationRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// Episodes.
+    pub episodes: usize,
+    /// Success rate.
+    pub success: f64,
+    /// Mean return.
+    pub return_mean: f64,
+    /// Standard deviation of the return.
+    pub return_std: f64,
+    /// Mean spectral arc length of the hand's speed.
+    pub smoothness_sparc: Option<f64>,
+    /// Mean log dimensionless jerk of the hand.
+    pub smoothness_ldlj: Option<f64>,
+    /// Milliseconds to choose an action.
+    pub action_ms: f64,
+}
+
+impl EvaluationRow {
+    pub(super) fn new(step: usize, summary: Summary) -> Self {
+        let Summary {
+            episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms, ..
+        } = summary;
+        Self { step, episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms }
+    }
+}
+
+/// A row of `losses.csv`: the mean of one loss over the last steps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LossRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// What it is.
+    pub name: String,
+    /// Its mean.
+    pub value: f32,
+}
+
+/// A row of `model.csv`: how well the model predicts the last evaluation's episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// The errors.
+    #[serde(flatten)]
+    pub open_loop: OpenLoop,
+}
+
+/// A row of `values.csv`: the agent's value estimates in the last evaluation's episodes, and the returns that followed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ValueRow {
+    /// Environment steps so far.
+    pub step: usize,
+    /// Mean of the estimates.
+    pub expected: f64,
+    /// Mean of the returns.
+    pub realised: f64,
+    /// Root mean square of the difference.
+    pub rmse: f64,
+    /// Correlation of the two over all time steps; 0 if one of them never changes.
+    pub correlation: f64,
+}
+
+impl ValueRow {
+    pub(super) fn new(step: usize, estimates: &[ValueEstimate]) -> Option<Self> {
+        let expected: Vec<f64> = estimates.iter().map(|estimate| f64::from(estimate.expected)).collect();
+        let realised: Vec<f64> = estimates.iter().map(|estimate| f64::from(estimate.realised)).collect();
+        let square = |(e, r): (&f64, &f64)| (e - r).powi(2);
+        let squares: Vec<f64> = expected.iter().zip(&realised).map(square).collect();
+        (!estimates.is_empty()).then(|| Self {
+            step,
+            expected: mean(&expected),
+            realised: mean(&realised),
+            rmse: mean(&squares).sqrt(),
+            correlation: correlation(&expected, &realised),
+        })
+    }
+}
+
+/// What a run has recorded so far; the CSV files are this.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(super) struct Progress {
+    pub(super) step: usize,
+    pub(super) seconds: f64,
+    pub(super) episodes: Vec<EpisodeRow>,
+    pub(super) evaluations: Vec<EvaluationRow>,
+    pub(super) losses: Vec<LossRow>,
+    #[serde(default)]
+    pub(super) model: Vec<ModelRow>,
+    #[serde(default)]
+    pub(super) values: Vec<ValueRow>,
+    /// The test, as far as it has come.
+    #[serde(default)]
+    pub(super) test: Evaluation,
+    /// Sum and count of each loss since the last row of it.
+    pub(super) pending: BTreeMap<String, (f32, usize)>,
+}
+
+impl Progress {
+    /// Takes in the losses of an update.
+    pub(super) fn note(&mut self, losses: Losses) {
+        let Self { step, losses: rows, pending, .. } = self;
+        for (name, value) in losses {
+            let (sum, count) = pending.entry(name.into()).or_default();
+            (*sum, *count) = (*sum + value, *count + 1);
+        }
+        if step.is_multiple_of(LOSSES_EVERY) {
+            let means = std::mem::take(pending).into_iter();
+            rows.extend(means.map(|(name, (sum, count))| LossRow { step: *step, name, value: sum / count as f32 }));
+        }
+    }
+
+    /// Writes the CSV files.
+    ///
+    /// # Errors
+    /// If one cannot be written.
+    pub(super) fn write_tables(&self, folder: &Path) -> Result<()> {
+        let Self { episodes, evaluations, losses, model, values, .. } = self;
+        if !model.is_empty() {
+            let rows = model.iter().map(|row| (row.step, &row.open_loop));
+            write_csv(&folder.join("model.csv"), &MODEL_COLUMNS, rows)?;
+        }
+        if !values.is_empty() {
+            write_csv(&folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
+        }
+        write_csv(&folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
+        write_csv(&folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations.iter())?;
+        write_csv(&folder.join("losses.csv"), &["step", "name", "value"], losses.iter())
+    }
+}
+
+/// Writes `test.csv`.
+pub(super) fn write_test(folder: &Path, test: &Evaluation) -> Result<()> {
+    let rows = test.results.iter().enumerate().map(|(i, result)| (i + 1, result));
+    write_csv(&folder.join("test.csv"), &TEST_COLUMNS, rows)
+}
+
+fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
+    let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
+    let composed =
+        writer.write_record(columns).and_then(|()| rows.into_iter().try_for_each(|row| writer.serialize(row)));
+    composed.map_err(|problem| Error::bad_file(path, problem))?;
+    let bytes = writer.into_inner().map_err(|problem| Error::bad_file(path, problem))?;
+    files::write(path, &bytes)
+}

@@ -1,0 +1,89 @@
+//! An environment of one's own enters everything: agents, evaluation, the oracle, replays, studies.
+
+#[path = "../examples/own_world.rs"]
+#[allow(dead_code)] // its `main`
+mod own_world;
+
+use std::sync::atomic::AtomicBool;
+
+use handful::prelude::*;
+use handful::study::config::RunConfig;
+use handful::study::run::Event;
+use handful::study::runner::{StudyObserver, StudyPlan, carry_out_all};
+use handful::watch::Recording;
+use own_world::{Puck, registry};
+
+struct Silent;
+
+impl StudyObserver for Silent {
+    fn started(&self, _run: usize, _config: &RunConfig, _done: usize) {}
+    fn happened(&self, _run: usize, _config: &RunConfig, _done: usize, _event: &Event) {}
+}
+
+/// The whole protocol in small: five methods train on the puck, are tested, compared and drawn.
+#[test]
+fn a_study_of_the_puck_ends_in_a_report() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let small = "steps = 500\nevaluate_every = 250\nevaluation_episodes = 2\ntest_episodes = 4\n";
+    let pets = "warm_up = 100\nfit_every = 200\n[pets.ensemble]\nhidden = [16]\nfirst_steps = 20\nsteps = 10\n\
+                [pets.planner.icem]\nhorizon = 4\npopulation = 10\nelites = 4\niterations = 1\n";
+    let registry = registry()
+        .preset("pets", &format!("agent = \"pets\"\n{small}[pets]\n{pets}"))
+        .preset("sac", &format!("agent = \"sac\"\n{small}[sac]\nhidden = [16]\nwarm_up = 200\n"))
+        .preset(
+            "dreamer",
+            &format!(
+                "agent = \"dreamer\"\n{small}[dreamer]\nbatch = 2\nlength = 8\ntrain_ratio = 4.0\nwarm_up = 100\n\
+                 [dreamer.world]\nunits = 16\nlayers = 1\n\
+                 [dreamer.world.rssm]\ndeter = 16\nblocks = 2\nhidden = 8\nstoch = 4\nclasses = 4\n\
+                 [dreamer.behaviour]\nunits = 16\nlayers = 1\n"
+            ),
+        );
+    let plan = StudyPlan {
+        tasks: vec!["puck".into()],
+        methods: ["random", "pets", "pets-learned", "dreamer", "sac"].map(String::from).into(),
+        seeds: 0..1,
+        folder: folder.path().into(),
+    };
+    let runs = plan.runs(&registry).expect("known names");
+    carry_out_all(&registry, &runs, 2, &Silent, &AtomicBool::new(false)).expect("healthy runs");
+    let learned = folder.path().join("puck/pets-learned/seed0");
+    let (config, mut method) = registry.trained_method(&learned).expect("a complete run");
+    assert_eq!(config.steps, 500);
+    let recording = Recording::of_episode("puck".into(), Puck::new(), &mut method, 0).expect("valid actions");
+    assert_eq!(recording.steps(), 50);
+    assert!(recording.to_html().contains("\"post\""), "its own bodies are drawn");
+    #[cfg(feature = "study")]
+    {
+        let folders = runs.iter().map(|(_, folder)| folder.as_path());
+        let tables = handful::study::tables::Tables::gather(folders).expect("the runs' tables");
+        tables.write(folder.path()).expect("a writable folder");
+        let text = handful::study::report::write(folder.path(), folder.path()).expect("a report");
+        assert!(text.contains("puck") && text.contains("pets-learned"), "{text}");
+        assert!(folder.path().join("puck-learning.svg").exists());
+    }
+}
+
+/// The oracle plans in the true puck: with the planner's preset it comes to every goal.
+#[test]
+fn the_oracle_brings_the_puck_home() {
+    let registry = registry();
+    let config = registry.config("puck", "oracle", 0, None, None).expect("a preset");
+    let mut oracle = registry.method(&config).expect("an oracle");
+    let mut evaluator = Evaluator::new(|| Ok(Puck::new())).expect("a puck");
+    let summary = evaluator.evaluate(&mut oracle, 10, EvalSeeds::Test).expect("valid actions").summary();
+    assert!(summary.success > 0.85, "{summary:?}");
+}
+
+/// What an environment lacks is said by name.
+#[test]
+fn what_is_missing_is_named() {
+    let bare = Registry::standard().env(EnvEntry::new("bare", || Ok(Puck::new())));
+    let refusal = |method: &str| {
+        let config = bare.config("bare", method, 0, None, None).expect("a preset");
+        bare.method(&config).expect_err("something is missing").to_string()
+    };
+    assert!(refusal("oracle").contains("with_oracle"), "{}", refusal("oracle"));
+    assert!(refusal("scripted").contains("no scripted policy"), "{}", refusal("scripted"));
+    assert!(refusal("pets").contains("learn_reward"), "{}", refusal("pets"));
+}
