@@ -15,6 +15,9 @@ use crate::rng;
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
 
+/// The curve of one seed: environment steps, and the value at each of them.
+pub type Curve = (Vec<f64>, Vec<f64>);
+
 /// The tables of a study.
 #[derive(Clone, Debug)]
 pub struct Tables {
@@ -120,7 +123,7 @@ impl Tables {
     ///
     /// # Errors
     /// If the table lacks a column.
-    pub fn curves(&self, task: &str, method: &str) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
+    pub fn curves(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
         curves(&self.evaluations, task, method, "success").map_err(inside)
     }
 
@@ -129,13 +132,7 @@ impl Tables {
     ///
     /// # Errors
     /// If the table lacks a column.
-    pub fn model_curves(
-        &self,
-        task: &str,
-        method: &str,
-        horizon: u32,
-        column: &str,
-    ) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
+    pub fn model_curves(&self, task: &str, method: &str, horizon: u32, column: &str) -> Result<Vec<Curve>> {
         let found = || {
             if self.models.width() == 0 {
                 return Ok(Vec::new());
@@ -151,7 +148,7 @@ impl Tables {
     ///
     /// # Errors
     /// If the table lacks the column.
-    pub fn value_curves(&self, task: &str, method: &str, column: &str) -> Result<Vec<(Vec<f64>, Vec<f64>)>> {
+    pub fn value_curves(&self, task: &str, method: &str, column: &str) -> Result<Vec<Curve>> {
         curves(&self.values, task, method, column).map_err(inside)
     }
 
@@ -169,27 +166,26 @@ impl Tables {
 }
 
 fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFrame> {
+    let tests = by_run(tests.clone().lazy(), &["success", "return", "length", "sparc", "ldlj"])?;
     let pairs = tests.clone().lazy().select([col("task"), col("method")]);
     let pairs = pairs.unique_stable(None, UniqueKeepStrategy::First).collect()?;
     let (tasks, methods) = (strings(&pairs, "task")?, strings(&pairs, "method")?);
     let mut columns: Vec<(&str, Vec<Option<f64>>)> = SUMMARY.map(|name| (name, Vec::new())).into();
     for (task, method) in tasks.iter().zip(&methods) {
-        let rows = of(tests, task, method)?;
-        let successes: Vec<f64> = booleans(&rows, "success")?;
+        let runs = of(&tests, task, method)?;
+        let success = lists(&runs, "success")?;
+        let by_seed: Vec<f64> = success.iter().map(|episodes| mean(episodes)).collect();
+        let successes = success.concat();
         let mean_of = |column: &str| -> PolarsResult<Option<f64>> {
-            let known: Vec<f64> = numbers(&rows, column)?.into_iter().flatten().collect();
+            let known = lists(&runs, column)?.concat();
             Ok((!known.is_empty()).then(|| mean(&known)))
         };
         let [low, high] = wilson(successes.iter().filter(|s| **s > 0.5).count(), successes.len());
-        let by_seed = by_seed(&rows, &successes)?;
         let bound = bootstrap(&by_seed, interquartile_mean, &mut rng::stream(0, "bootstrap"));
         let curves = curves(evaluations, task, method, "success")?;
         let reached: Vec<f64> = curves.iter().filter_map(|(x, y)| steps_to(LEVEL, x, y)).collect();
         let areas: Vec<f64> = curves.iter().map(|(x, y)| area_under_curve(x, y)).collect();
-        let budget = curves
-            .iter()
-            .filter_map(|(x, _)| x.last().copied())
-            .fold(None, |a: Option<f64>, x| Some(a.map_or(x, |a| a.max(x))));
+        let budget = curves.iter().filter_map(|(x, _)| x.last().copied()).reduce(f64::max);
         // The median over all seeds; a seed that never reaches the level counts as infinitely many steps.
         let median = (!curves.is_empty()).then(|| median_with_missing(&reached, curves.len())).flatten();
         let values = [
@@ -252,36 +248,25 @@ fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
     frame.clone().lazy().filter(here).collect()
 }
 
-/// The success rate of each seed.
-fn by_seed(rows: &DataFrame, successes: &[f64]) -> PolarsResult<Vec<f64>> {
-    let seeds: Vec<f64> = numbers(rows, "seed")?.into_iter().flatten().collect();
-    let mut distinct = seeds.clone();
-    distinct.dedup();
-    let of = |seed: &f64| {
-        let own: Vec<f64> = seeds.iter().zip(successes).filter(|(s, _)| *s == seed).map(|(_, y)| *y).collect();
-        mean(&own)
-    };
-    Ok(distinct.iter().map(of).collect())
+/// Groups rows by run: one row per run, in the order of the runs, with each of these columns as a list.
+fn by_run(rows: LazyFrame, columns: &[&str]) -> PolarsResult<DataFrame> {
+    let lists: Vec<Expr> = columns.iter().map(|name| col(*name).strict_cast(DataType::Float64).drop_nulls()).collect();
+    rows.group_by_stable(["task", "method", "seed"].map(col)).agg(lists).collect()
 }
 
 /// A column over environment steps, for each seed.
-fn curves(frame: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<(Vec<f64>, Vec<f64>)>> {
-    let rows = of(frame, task, method)?;
-    if rows.height() == 0 {
+fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
+    if rows.width() == 0 {
         return Ok(Vec::new());
     }
-    let column = |name: &str| -> PolarsResult<Vec<f64>> { Ok(numbers(&rows, name)?.into_iter().flatten().collect()) };
-    let (seeds, steps, values) = (column("seed")?, column("step")?, column(value)?);
-    let mut curves: Vec<(f64, Vec<f64>, Vec<f64>)> = Vec::new();
-    for ((seed, step), value) in seeds.into_iter().zip(steps).zip(values) {
-        if curves.last().is_none_or(|(last, ..)| *last != seed) {
-            curves.push((seed, Vec::new(), Vec::new()));
-        }
-        let (_, x, y) = curves.last_mut().expect("one was just added");
-        x.push(step);
-        y.push(value);
-    }
-    Ok(curves.into_iter().map(|(_, x, y)| (x, y)).collect())
+    let known = of(rows, task, method)?.lazy().filter(col(value).is_not_null());
+    let runs = by_run(known, &["step", value])?;
+    Ok(lists(&runs, "step")?.into_iter().zip(lists(&runs, value)?).collect())
+}
+
+fn lists(runs: &DataFrame, column: &str) -> PolarsResult<Vec<Vec<f64>>> {
+    let numbers = |list: Series| Ok(list.f64()?.iter().flatten().collect());
+    runs.column(column)?.list()?.no_null_series_iter().map(numbers).collect()
 }
 
 fn strings(frame: &DataFrame, column: &str) -> PolarsResult<Vec<String>> {
@@ -291,10 +276,6 @@ fn strings(frame: &DataFrame, column: &str) -> PolarsResult<Vec<String>> {
 fn numbers(frame: &DataFrame, column: &str) -> PolarsResult<Vec<Option<f64>>> {
     let column = frame.column(column)?.cast(&DataType::Float64)?;
     Ok(column.f64()?.iter().collect())
-}
-
-fn booleans(frame: &DataFrame, column: &str) -> PolarsResult<Vec<f64>> {
-    Ok(frame.column(column)?.bool()?.iter().map(|b| f64::from(b == Some(true))).collect())
 }
 
 fn read(path: &Path) -> Result<DataFrame> {

@@ -83,6 +83,7 @@ impl Ensemble {
         config.check()?;
         let cpu = device();
         let (features, actions) = (FeatureMap::new(spec)?, spec.action_size);
+        let features = if config.learn_reward { features.with_goals(spec) } else { features };
         let inputs = features.input_size() + actions;
         let outputs = features.predicted.len() + usize::from(config.learn_reward);
         let shape = MlpConfig {
