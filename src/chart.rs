@@ -1,6 +1,18 @@
-//! Charts for chapters and examples: a few lines, points and bands in one frame, as SVG.
+//! Charts for chapters and examples: lines, points and bands in one frame, as SVG.
 //!
-//! In a notebook a [`Chart`] that ends a cell shows itself.
+//! ```
+//! use handful::chart::Chart;
+//!
+//! let returns = (0..10).map(|episode| (200.0 * f64::from(episode), -1200.0 + 100.0 * f64::from(episode)));
+//! let svg = Chart::new("environment steps", "episode return")
+//!     .line("an agent", returns)
+//!     .dashed("random actions", [(0.0, -1200.0), (1800.0, -1200.0)])
+//!     .svg()?;
+//! assert!(svg.starts_with("<svg"));
+//! # Ok::<(), handful::error::Error>(())
+//! ```
+//!
+//! In a notebook, a [`Chart`] that is the last expression of a cell is displayed.
 
 use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
 use plotters::element::DashedPathElement;
@@ -8,7 +20,7 @@ use plotters::prelude::*;
 
 use crate::error::{Error, Result};
 
-/// Colours that stay apart for colour-blind readers (Okabe and Ito).
+/// Colours that colour-blind readers can tell apart (Okabe and Ito).
 pub const PALETTE: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -20,10 +32,10 @@ pub const PALETTE: [RGBColor; 7] = [
 ];
 /// The font of all figures.
 pub const FONT: &str = "sans-serif";
-/// Axes and their labels.
+/// The colour of axes and other secondary lines.
 pub const GREY: RGBColor = RGBColor(110, 110, 110);
 
-/// A chart, to be filled with [`Chart::line`] and its like.
+/// A chart. [`Chart::line`], [`Chart::dashed`], [`Chart::points`] and [`Chart::band`] add series to it.
 #[derive(Clone, Debug, Default)]
 pub struct Chart {
     x_label: String,
@@ -50,45 +62,45 @@ enum Shape {
 }
 
 impl Chart {
-    /// An empty chart with these names (and units) at its axes.
+    /// An empty chart with labels (quantity and unit) for its axes.
     pub fn new(x_label: &str, y_label: &str) -> Self {
         Self { x_label: x_label.into(), y_label: y_label.into(), ..Self::default() }
     }
 
-    /// Shows x on a logarithmic scale.
+    /// Uses a logarithmic scale for x. Points with x ≤ 0 are left out.
     pub fn log_x(mut self) -> Self {
         self.x_log = true;
         self
     }
 
-    /// Shows y on a logarithmic scale.
+    /// Uses a logarithmic scale for y. Points with y ≤ 0 are left out.
     pub fn log_y(mut self) -> Self {
         self.y_log = true;
         self
     }
 
-    /// Shows y between these.
+    /// Sets the range of the y axis, which otherwise follows from the points.
     pub fn between(mut self, low: f64, high: f64) -> Self {
         self.y_range = Some([low, high]);
         self
     }
 
-    /// Adds a line.
+    /// Adds a line through `(x, y)` points.
     pub fn line(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Line, points.into_iter().collect())
     }
 
-    /// Adds a dashed line: a bound, a baseline, the truth.
+    /// Adds a dashed line, for a bound, a baseline or the true values.
     pub fn dashed(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Dashed, points.into_iter().collect())
     }
 
-    /// Adds points.
+    /// Adds points, which are not connected.
     pub fn points(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Points, points.into_iter().collect())
     }
 
-    /// Adds a band of `(x, low, high)`, in the colour of the line that was added last.
+    /// Adds a band between `low` and `high`, from `(x, low, high)`, in the colour of the series added last.
     pub fn band(self, band: impl IntoIterator<Item = (f64, f64, f64)>) -> Self {
         let band: Vec<(f64, f64, f64)> = band.into_iter().collect();
         let low = band.iter().map(|(x, low, _)| (*x, *low));
@@ -102,16 +114,16 @@ impl Chart {
         self
     }
 
-    /// The chart as SVG.
+    /// Draws the chart and returns it as SVG.
     ///
     /// # Errors
-    /// If nothing in it can be drawn: no finite point (on a logarithmic scale: no positive one).
+    /// If there is nothing to draw: no finite point (on a logarithmic scale, no positive one).
     pub fn svg(&self) -> Result<String> {
         let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
         let x = span(shown().map(|(x, _)| *x), self.x_log);
         let y = self.y_range.map(|[low, high]| (low, high)).or_else(|| span(shown().map(|(_, y)| *y), self.y_log));
         let (Some((x0, x1)), Some((y0, y1))) = (x, y) else {
-            return Err(Error::Config("chart: nothing in it can be drawn".into()));
+            return Err(Error::Config("chart: there is nothing to draw".into()));
         };
         let mut svg = String::new();
         let drawn = match (self.x_log, self.y_log) {
@@ -171,7 +183,7 @@ impl Chart {
                 Shape::Band => chart.draw_series([Polygon::new(points, colour.mix(0.2))])?,
             };
             if !name.is_empty() {
-                // In the legend, a small piece of it.
+                // A short piece of the line, or one point, for the legend.
                 let series = series.label(name);
                 match shape {
                     Shape::Dashed => {
@@ -197,7 +209,7 @@ impl Chart {
         Ok(area.present()?)
     }
 
-    /// Where a legend hides the fewest points.
+    /// The corner in which the legend hides the fewest points.
     fn emptiest_corner(&self) -> SeriesLabelPosition {
         let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
         let along = |value: f64, log: bool| if log { value.ln() } else { value };
@@ -228,7 +240,7 @@ impl Chart {
         best.expect("four corners").0
     }
 
-    /// Shows it in a notebook; called by the kernel.
+    /// Displays the chart in a notebook; called by the evcxr kernel.
     pub fn evcxr_display(&self) {
         match self.svg() {
             Ok(svg) => println!("EVCXR_BEGIN_CONTENT image/svg+xml\n{svg}\nEVCXR_END_CONTENT"),
@@ -237,7 +249,7 @@ impl Chart {
     }
 }
 
-/// From the least to the largest number, and a little beyond.
+/// The range of the numbers with a small margin, or `None` if there are none.
 fn span(numbers: impl Iterator<Item = f64>, log: bool) -> Option<(f64, f64)> {
     let (low, high) =
         numbers.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (f64::min(low, x), f64::max(high, x)));
@@ -251,7 +263,7 @@ fn span(numbers: impl Iterator<Item = f64>, log: bool) -> Option<(f64, f64)> {
     Some((low - margin, high + margin))
 }
 
-/// A number without noughts that say nothing.
+/// A number with up to four decimals, without trailing zeros.
 fn plain(x: f64) -> String {
     let text = format!("{x:.4}");
     let text = text.trim_end_matches('0').trim_end_matches('.');

@@ -1,4 +1,4 @@
-//! The figures of a study, as SVG, from its tables alone.
+//! The figures of a study, as SVG, drawn from its tables alone.
 
 use std::path::Path;
 
@@ -15,15 +15,15 @@ use crate::files;
 
 const SIZE: (u32, u32) = (820, 440);
 
-/// The methods that have the palette's colours in every figure of every study. Others take what is left.
+/// The methods that have the same colour of the palette in every study. Others take the colours that are left.
 const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "planet", "scripted", "random"];
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
 
-/// Success over environment steps for one task: a line for the mean of each learning method, its band from the
-/// worst seed to the best, and a dashed line for each method that does not learn. False, and nothing drawn, if none
-/// learns.
+/// Success over environment steps for one task: a line for the mean of each learning method with a band from its worst
+/// seed to its best, and a dashed line for each method that does not learn. Returns `false`, and draws nothing, if no
+/// method learns.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -62,7 +62,7 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<bool>
             .label_style((FONT, 14))
             .draw()?;
         let bands: Vec<Band> = learning.iter().map(|(.., curves)| band(curves)).collect();
-        // All bands first: none shall lie on a line.
+        // All bands first, so that none covers a line.
         for ((color, _, curves), (steps, band)) in learning.iter().zip(&bands) {
             let outline = steps.iter().zip(band).map(|(x, [low, _, _])| (*x, *low));
             let back = steps.iter().zip(band).rev().map(|(x, [_, _, high])| (*x, *high));
@@ -94,7 +94,8 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<bool>
     Ok(true)
 }
 
-/// The test of every method on one task: success with its 95 % interval, and smoothness of the hand if there is one.
+/// The final test of every method on one task: success with its 95 % interval, and the smoothness of the hand's movement
+/// if the environment has a hand.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -109,7 +110,7 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
     let roughest = rows.iter().filter_map(|(.., sparc)| *sparc).reduce(f64::min);
     let count = rows.len();
     draw(path, |area| {
-        let area = area.margin(14, 10, 10, 10).titled(&format!("{task}: the test at the end"), (FONT, 20))?;
+        let area = area.margin(14, 10, 10, 10).titled(&format!("{task}: final test"), (FONT, 20))?;
         let panel = |area: &Area, title: &str, left_margin: u32, from: f64, to: f64, percent: bool| -> Drawn {
             let mut chart = ChartBuilder::on(area)
                 .caption(title, (FONT, 15))
@@ -152,21 +153,21 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         let (left, right) = area.split_horizontally(470);
         success(&left)?;
         let from = 1.1 * roughest.min(-2.0);
-        panel(&right, "smoothness (SPARC; a perfect movement has -1.4)", 0, from, -1.0, false)
+        panel(&right, "smoothness (SPARC; minimum jerk: -1.4)", 0, from, -1.0, false)
     })
 }
 
-/// The steps ahead for which a model's error is drawn.
-const FORESIGHT: [u32; 3] = [1, 5, 15];
+/// The horizons, in steps, for which a model's open-loop error is drawn.
+const HORIZONS: [u32; 3] = [1, 5, 15];
 
-/// What a method's model is worth over training: its error so many steps ahead, and how often the truth lies inside its
-/// interval of 90 %. False, and nothing drawn, if the method has no model.
+/// The quality of a method's model over training: its open-loop error at several horizons, and the coverage of its 90 %
+/// interval. Returns `false`, and draws nothing, if the method has no model.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
 pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<bool> {
     let mut lines = Vec::new();
-    for (color, horizon) in PALETTE.into_iter().zip(FORESIGHT) {
+    for (color, horizon) in PALETTE.into_iter().zip(HORIZONS) {
         let error = tables.model_curves(task, method, horizon, "rmse")?;
         let coverage = tables.model_curves(task, method, horizon, "coverage90")?;
         if !error.is_empty() {
@@ -186,7 +187,7 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
     };
     let panels = [
         Panel {
-            title: "error (1: as good as foreseeing no change)",
+            title: "error (1: predicting no change)",
             range: 0.0..worst.clamp(1.05, 4.0),
             mark: Some(1.0),
             percent: false,
@@ -194,7 +195,7 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
             legend: SeriesLabelPosition::UpperRight,
         },
         Panel {
-            title: "truth inside the 90 % interval",
+            title: "coverage of the 90 % interval",
             range: 0.0..1.03,
             mark: Some(0.9),
             percent: true,
@@ -202,34 +203,31 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
             legend: SeriesLabelPosition::LowerRight,
         },
     ];
-    over_training(
-        path,
-        &format!("{task}: what the model of {method} foresees in episodes that it has not learned from"),
-        &panels,
-    )?;
+    over_training(path, &format!("{task}: open-loop predictions of {method} on held-out episodes"), &panels)?;
     Ok(true)
 }
 
-/// What a method's agent expects over training, beside what comes. False, and nothing drawn, if it expects nothing.
+/// The discounted return that a method's agent predicts over training, beside the realised one. Returns `false`, and draws
+/// nothing, if it predicts none.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
 pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<bool> {
     let curves = |column: &str| tables.value_curves(task, method, column);
-    let (expected, realised, correlation) = (curves("expected")?, curves("realised")?, curves("correlation")?);
-    if expected.is_empty() {
+    let (predicted, realised, correlation) = (curves("expected")?, curves("realised")?, curves("correlation")?);
+    if predicted.is_empty() {
         return Ok(false);
     }
-    let [expected, realised, correlation] = [expected, realised, correlation].map(|curves| band(&curves));
-    let all = expected.1.iter().chain(&realised.1).flatten().copied();
+    let [predicted, realised, correlation] = [predicted, realised, correlation].map(|curves| band(&curves));
+    let all = predicted.1.iter().chain(&realised.1).flatten().copied();
     let (low, high) = (all.clone().fold(0.0, f64::min), all.fold(0.0, f64::max));
     let panels = [
         Panel {
-            title: "mean over all moments",
+            title: "mean over time steps",
             range: 1.05 * low..1.05 * high.max(low + 1e-3),
             mark: None,
             percent: false,
-            lines: vec![(PALETTE[0], "expected".into(), expected), (PALETTE[1], "came".into(), realised)],
+            lines: vec![(PALETTE[0], "predicted".into(), predicted), (PALETTE[1], "realised".into(), realised)],
             legend: SeriesLabelPosition::LowerRight,
         },
         Panel {
@@ -237,29 +235,29 @@ pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<
             range: -0.3..1.03,
             mark: Some(1.0),
             percent: false,
-            lines: vec![(PALETTE[2], "over all moments".into(), correlation)],
+            lines: vec![(PALETTE[2], "over time steps".into(), correlation)],
             legend: SeriesLabelPosition::LowerRight,
         },
     ];
-    over_training(path, &format!("{task}: discounted rewards that {method} expects, and those that come"), &panels)?;
+    over_training(path, &format!("{task}: predicted and realised discounted return of {method}"), &panels)?;
     Ok(true)
 }
 
-/// Steps, and the lowest, mean and highest value over the seeds at each.
+/// Environment steps, and the lowest, mean and highest value over the seeds at each of them.
 type Band = (Vec<f64>, Vec<[f64; 3]>);
 
 /// One of two charts side by side.
 struct Panel {
     title: &'static str,
     range: std::ops::Range<f64>,
-    /// A value to compare with.
+    /// A reference value, drawn as a dashed line.
     mark: Option<f64>,
     percent: bool,
     lines: Vec<(RGBColor, String, Band)>,
     legend: SeriesLabelPosition,
 }
 
-/// Draws what changes over training: the means over the seeds, two charts side by side.
+/// Draws the means over the seeds against environment steps, in two charts side by side.
 fn over_training(path: &Path, title: &str, panels: &[Panel; 2]) -> Result<()> {
     let steps = panels.iter().flat_map(|panel| &panel.lines).flat_map(|(_, _, (steps, _))| steps.iter().copied());
     let (first, last) = (steps.clone().fold(f64::INFINITY, f64::min), steps.fold(0.0, f64::max));
@@ -302,7 +300,7 @@ fn over_training(path: &Path, title: &str, panels: &[Panel; 2]) -> Result<()> {
     })
 }
 
-/// With a decimal where the range is small.
+/// A label with one decimal if the range is small, else without.
 fn number(y: f64, range: &std::ops::Range<f64>) -> String {
     if range.end - range.start < 10.0 { format!("{y:.1}") } else { format!("{y:.0}") }
 }
@@ -334,7 +332,7 @@ fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
     Ok(of_task.into_iter().map(|method| (colour_of(&method), method)).collect())
 }
 
-/// Steps common to all seeds, with the lowest, mean and highest value at each.
+/// The steps that all seeds have in common, with the lowest, mean and highest value at each.
 fn band(curves: &[(Vec<f64>, Vec<f64>)]) -> Band {
     let shortest = curves.iter().min_by_key(|(x, _)| x.len()).expect("at least one curve");
     let rows = (0..shortest.0.len()).map(|i| {

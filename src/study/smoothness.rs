@@ -1,20 +1,19 @@
-//! How smooth a movement is.
+//! Smoothness of a movement: SPARC and LDLJ.
 //!
-//! Both measures look at the movement alone: the part between the first and the last moment at which
-//! the hand is faster than a twentieth of its top speed.
+//! Both measures are computed on the movement alone, that is, from the first to the last time step at which the hand is
+//! faster than a twentieth of its top speed.
 
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex;
 
-/// Speeds below this fraction of the top speed are rest.
+/// Speeds below this fraction of the top speed count as rest.
 const REST: f64 = 0.05;
-/// SPARC looks at frequencies up to this, Hz (and never beyond half the sampling rate).
+/// SPARC uses frequencies up to this, in Hz (and never beyond half the sampling rate),
 const CUT_OFF: f64 = 10.0;
-/// ... and from the first to the last of them whose magnitude is at least this part of the largest.
+/// from the first to the last of them whose magnitude is at least this fraction of the largest.
 const THRESHOLD: f64 = 0.05;
 
-/// Smoothness of a path of hand positions (m) sampled every `dt` seconds: SPARC and LDLJ. `None`
-/// where nothing moves.
+/// SPARC and LDLJ of a path of hand positions (m) sampled every `dt` seconds. `None` if the hand does not move.
 pub fn of_path(path: &[[f64; 3]], dt: f64) -> Option<(f64, f64)> {
     let velocity: Vec<[f64; 3]> = path.windows(2).map(|p| std::array::from_fn(|i| (p[1][i] - p[0][i]) / dt)).collect();
     let speed: Vec<f64> = velocity.iter().map(norm).collect();
@@ -32,9 +31,8 @@ fn norm(v: &[f64; 3]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
-/// Spectral arc length of a speed profile sampled at `rate` Hz (Balasubramanian et al. 2015):
-/// dimensionless, the same for slow and fast, near and far; a minimum-jerk movement has about -1.4, and
-/// less smooth ones are more negative.
+/// Spectral arc length (SPARC) of a speed profile sampled at `rate` Hz (Balasubramanian et al. 2015). It is dimensionless
+/// and does not depend on amplitude or duration. A minimum-jerk movement has about -1.4; less smooth ones are more negative.
 pub fn sparc(speed: &[f64], rate: f64) -> f64 {
     let bins = (speed.len().next_power_of_two() << 4).max(16);
     let mut spectrum: Vec<Complex<f64>> = speed.iter().map(|&v| v.into()).collect();
@@ -53,9 +51,9 @@ pub fn sparc(speed: &[f64], rate: f64) -> f64 {
     -relative[first..=last].windows(2).map(|m| width.hypot(m[1] - m[0])).sum::<f64>()
 }
 
-/// Log dimensionless jerk of a velocity sampled at `rate` Hz: minus the logarithm of squared jerk, made
-/// independent of duration and top speed. A minimum-jerk movement has about -5.3. Very sensitive to noise and to the
-/// sampling rate: compare only at equal rates.
+/// Log dimensionless jerk (LDLJ) of a velocity sampled at `rate` Hz: minus the logarithm of the integrated squared jerk,
+/// scaled so that it does not depend on duration or top speed. A minimum-jerk movement has about -5.3. It is very sensitive
+/// to noise and to the sampling rate: compare only values at equal rates.
 pub fn ldlj(velocity: &[[f64; 3]], rate: f64) -> f64 {
     let dt = 1.0 / rate;
     let duration = velocity.len() as f64 * dt;
