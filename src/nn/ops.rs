@@ -1,7 +1,22 @@
 //! Operations that dfdx's tape records as one step each, with gradients of our own.
 //!
 //! dfdx differentiates; these kernels calculate. A fused layer saves dfdx's separate elementwise
-//! passes and uses both cores. Every gradient here is checked against finite differences.
+//! passes and uses all cores. Every gradient here is checked against finite differences.
+//!
+//! ```
+//! use handful::nn::dfdx::prelude::*;
+//! use handful::nn::{Activation, Grad, device, ops, tensor, values};
+//!
+//! // relu(x w + b), differentiated with respect to w and b but not to x.
+//! let x = tensor(&device(), vec![1.0, 2.0], (1, 1, 2));
+//! let (w, b) = (tensor(&device(), vec![0.5, 0.25], (1, 2, 1)), tensor(&device(), vec![0.0], (1, 1, 1)));
+//! let y = ops::dense(x.clone().leaky_traced(), &w, &b, Activation::Relu, Grad::Params);
+//! assert_eq!(values(&y), [1.0]);
+//! let mut gradients = y.sum::<Rank0, _>().backward();
+//! assert_eq!(**gradients.get_or_alloc_mut(&w)?, [1.0, 2.0]);
+//! assert_eq!(**gradients.get_or_alloc_mut(&x)?, [0.0, 0.0]);
+//! # Ok::<(), dfdx::tensor::CpuError>(())
+//! ```
 
 use dfdx::prelude::*;
 use dfdx::tensor::{Cpu, CpuError, Gradients};
@@ -86,7 +101,7 @@ pub fn dense<T: Tape<f32, Cpu>>(
     let shape = DenseShape { members, batch, input, output, shared_input: x_members == 1 };
 
     let mut y = vec![0.0; members * batch * output];
-    // The gradient of a ReLU can be told from its result, that of a SiLU cannot.
+    // The gradient of a ReLU follows from its result, that of a SiLU does not.
     let mut before = (T::OWNS_TAPE && activation == Activation::Silu).then(|| vec![0.0; y.len()]);
     kernels::dense(&mut y, before.as_deref_mut(), values(&x), values(w), values(b), shape, activation);
     let y = x.device().tensor_from_vec(y, (members, batch, output));
@@ -156,8 +171,7 @@ pub fn join<T: Tape<f32, Cpu> + Merge<R>, R: Tape<f32, Cpu>>(a: Tensor3<T>, b: T
     y.put_tape(tape)
 }
 
-/// Records an operation on a tape that is handed on from one to the next: in a loop over time, where a result is used
-/// several times, that is simpler than tensors which each carry a tape of their own.
+/// Records an operation on a tape that is handed on from one operation to the next, see [`super::tape`].
 pub fn record<T: Tape<f32, Cpu>>(
     tape: &mut T,
     x: &Tensor3,
@@ -208,7 +222,7 @@ pub fn stack<T: Tape<f32, Cpu>>(mut tape: T, parts: &[Tensor3]) -> Tensor3<T> {
     y.put_tape(tape)
 }
 
-/// Multiplies every row of a single network's tensor by a number of its own.
+/// Multiplies each row of a single network's tensor `[1, batch, features]` by its own factor.
 pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(_, batch, features) = x.shape();
@@ -230,8 +244,8 @@ pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<
     y.put_tape(tape)
 }
 
-/// A function of each row, `[members, batch, outputs]`: `f(row's number, row, value, jacobian)` writes its value and its Jacobian
-/// `[outputs, features]`. Whatever knows its own derivatives joins the tape here: a loss, or a simulator.
+/// A function of each row, `[members, batch, outputs]`: `f(row's index, row, value, jacobian)` writes its value and its
+/// Jacobian `[outputs, features]`. For functions that know their own derivatives: a loss, or a simulator.
 pub fn map_rows<T: Tape<f32, Cpu>>(
     x: Tensor3<T>,
     outputs: usize,
@@ -263,8 +277,8 @@ pub fn map_rows<T: Tape<f32, Cpu>>(
     y.put_tape(tape)
 }
 
-/// Gates what stands in the first third of each row, `[members, batch, 3 n]`, by the sigmoid of what stands in the last; the
-/// second stays as it is: `[members, batch, 2 n]`.
+/// Multiplies the first third of each row `[members, batch, 3 n]` by the sigmoid of the last third; the second third stays as
+/// it is: `[members, batch, 2 n]`.
 pub fn gated<T: Tape<f32, Cpu>>(x: Tensor3<T>) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(members, batch, width) = x.shape();
@@ -303,13 +317,13 @@ pub fn gate_rows(rows: &mut Vec<f32>, n: usize) {
     rows.truncate(2 * n * count);
 }
 
-/// A number for each row, `[members, batch, 1]`: `loss(row's number, row, slope)` returns it and writes its gradient with
-/// respect to the row into `slope`. Losses with a short gradient of their own are best written so.
+/// A loss of each row, `[members, batch, 1]`: `loss(row's index, row, slope)` returns it and writes its gradient with respect
+/// to the row into `slope`.
 pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3<T> {
     map_rows(x, 1, |i, row, value, slope| value[0] = loss(i, row, slope))
 }
 
-/// The squared distance of each row from the same row of `target`, `[members, batch, 1]`.
+/// The squared distance of each row from the same row of `target`, summed over features: `[members, batch, 1]`.
 pub fn squared_distance<T: Tape<f32, Cpu>>(x: Tensor3<T>, target: &Tensor3) -> Tensor3<T> {
     assert_eq!(x.shape(), target.shape(), "a target for each number");
     let (target, width) = (values(target), target.shape().2);
