@@ -46,6 +46,7 @@ pub mod ops;
 pub(crate) mod parameters;
 pub mod recurrent;
 pub mod tape;
+mod tensors;
 pub mod two_hot;
 
 pub use crate::checkpoint::Weights;
