@@ -10,11 +10,11 @@ use std::path::Path;
 use handful::agent::{DreamerConfig, Preset};
 use handful::chart::Chart;
 use handful::env::{Env, Spec, Task, World};
-use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
+use handful::model::open_loop::{OpenLoopModel, open_loop};
 use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, WorldModel};
 use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
-use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
+use handful::replay::{Episode, ReplayBuffer, SequenceReplay, Transition};
 use handful::rng::{self, Rng};
 
 /// Episodes for training.

@@ -2,13 +2,13 @@
 
 use handful::env::{Env, Feature, KnownReward, Spec, Task};
 use handful::model::calibration::{GaussianForecast, coverage};
-use handful::model::open_loop::{Episode, OpenLoop, open_loop};
+use handful::model::open_loop::{OpenLoop, open_loop};
 use handful::model::{
     Autoencoder, AutoencoderConfig, Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward,
     RssmConfig, WorldModel, WorldModelConfig,
 };
 use handful::nn::{Adam, AdamConfig, tensor, values};
-use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
+use handful::replay::{Episode, ReplayBuffer, SequenceReplay, Transition};
 use handful::rng::{self, Rng};
 use nalgebra::Vector3;
 

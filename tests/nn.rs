@@ -197,10 +197,10 @@ fn a_total_is_a_weighted_sum_of_means() {
 #[test]
 fn gradients_of_the_block_gru() {
     let mut rng = rng::stream(11, "gru");
-    let (blocks, memory, beside) = (2, 6, 4);
-    let layer = BlockDense::new(&device(), blocks, memory, beside, 3 * memory, &mut rng);
+    let (blocks, state, second) = (2, 6, 4);
+    let layer = BlockDense::new(&device(), blocks, state, second, 3 * state, &mut rng);
     let parameters: Vec<Tensor3> = layer.parameters().into_iter().map(|(_, p)| p.clone()).collect();
-    let inputs: Vec<Tensor3> = [random((1, 5, memory), &mut rng), random((1, 5, beside), &mut rng)]
+    let inputs: Vec<Tensor3> = [random((1, 5, state), &mut rng), random((1, 5, second), &mut rng)]
         .into_iter()
         .chain(parameters.iter().map(|p| random(*p.shape(), &mut rng)))
         .collect();
@@ -209,12 +209,11 @@ fn gradients_of_the_block_gru() {
         layer.parameters_mut().into_iter().zip(parameters).for_each(|((_, own), given)| *own = given.clone());
         layer
     };
-    check_operation!(inputs, |x, [beside, weight, bias, of_beside]| {
-        let (memory, tape) = x.split_tape();
-        let layer = with(&[weight.clone(), bias.clone(), of_beside.clone()]);
-        let mut tape = tape;
-        let gates = layer.on(&mut tape, &memory, Some(beside));
-        recurrent::gru(&mut tape, &gates, &memory, blocks).put_tape(tape)
+    check_operation!(inputs, |x, [second, weight, bias, of_second]| {
+        let (state, mut tape) = x.split_tape();
+        let layer = with(&[weight.clone(), bias.clone(), of_second.clone()]);
+        let gates = layer.on(&mut tape, &state, Some(second));
+        recurrent::gru(&mut tape, &gates, &state, blocks).put_tape(tape)
     });
 }
 

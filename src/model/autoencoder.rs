@@ -6,10 +6,10 @@ use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
 use super::features::LatentFeatures;
-use super::open_loop::{Episode, OpenLoopModel, actions_from};
+use super::open_loop::{OpenLoopModel, actions_from};
 use crate::env::Spec;
 use crate::nn::{Adam, Grad, Mlp, TapeOps, Tensor3, device, ops, parameters_of_fields, tensor};
-use crate::replay::SequenceBatch;
+use crate::replay::{Episode, SequenceBatch};
 use crate::rng::Rng;
 
 /// Sizes of an [`Autoencoder`].

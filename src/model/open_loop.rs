@@ -2,7 +2,8 @@
 //! happened. The actions of recorded episodes are replayed in the model, from many start times.
 //!
 //! ```
-//! use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
+//! use handful::model::open_loop::{OpenLoopModel, open_loop};
+//! use handful::replay::Episode;
 //! use handful::rng::{self, Rng};
 //!
 //! /// Predicts that nothing ever changes.
@@ -36,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use super::calibration::{GaussianForecast, coverage};
 use super::{Dynamics, Imagination, Propagation, Reward};
 use crate::env::KnownReward;
-pub use crate::replay::Episode;
+use crate::replay::Episode;
 use crate::rng::Rng;
 
 /// Numbers of time steps over which predictions are evaluated.

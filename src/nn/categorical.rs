@@ -8,13 +8,13 @@
 //! // Two variables of three classes.
 //! let z = Categorical { count: 2, classes: 3, unimix: 0.01 };
 //! let logits = |numbers: [f32; 6]| tensor(&device(), numbers.to_vec(), (1, 1, 6));
-//! let posterior = logits([2.0, 0.0, 0.0, 0.0, 3.0, 0.0]);
+//! let posterior = logits([1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
 //! let prior = logits([0.0; 6]);
 //! let sample = z.sample(&mut NoneTape, &posterior, &mut handful::rng::stream(0, "example"));
 //! assert_eq!(values(&sample).iter().sum::<f32>(), 2.0);
 //!
 //! let kl = |free_nats| values(&z.dynamics_kl(&mut NoneTape, &posterior, &prior, free_nats))[0];
-//! assert!(kl(0.0) > 0.5 && kl(0.0) < 1.0);
+//! assert!(kl(0.0) > 0.0 && kl(0.0) < 1.0);
 //! assert_eq!(kl(1.0), 1.0);
 //! ```
 
@@ -275,7 +275,7 @@ mod tests {
         ];
         let mut gradients = dynamics.sum::<Rank0, _>().backward();
         near("of the prior", &gradient(&mut gradients, &prior), &expected, 1e-6);
-        near("of the posterior", &gradient(&mut gradients, &posterior), &[0.0; 8], 0.0);
+        near("of the posterior", &gradient(&mut gradients, &posterior), &[0.0; 8], 1e-9);
 
         let mut tape = OwnedTape::default();
         let representation = TWO.representation_kl(&mut tape, &posterior, &prior, 0.0).put_tape(tape) * 0.1;
@@ -291,7 +291,7 @@ mod tests {
         ];
         let mut gradients = representation.sum::<Rank0, _>().backward();
         near("of the posterior", &gradient(&mut gradients, &posterior), &expected, 1e-6);
-        near("of the prior", &gradient(&mut gradients, &prior), &[0.0; 8], 0.0);
+        near("of the prior", &gradient(&mut gradients, &prior), &[0.0; 8], 1e-9);
 
         let mut tape = OwnedTape::default();
         let free = TWO.dynamics_kl(&mut tape, &posterior, &prior, 1.0).put_tape(tape);

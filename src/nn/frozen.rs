@@ -1,15 +1,15 @@
-//! Networks that only predict: plain weights, no tape. A panel of rows walks through all layers while it stays in the
-//! processor's innermost cache, so that nothing is written to memory but the answer.
+//! Networks for inference only: plain weights, no tape. A panel of rows passes through all layers while it stays in the
+//! processor's first-level cache, so that only the result is written to memory.
 
 use pulp::Simd;
 
 use super::Activation;
 use super::kernels::activate;
 
-/// Rows that walk through a network together: two vectors of the widest kind.
+/// Rows that pass through a network together: two of the widest vectors.
 pub const PANEL: usize = 32;
 
-/// Outputs that are summed up at once. With two vectors each, they fill the registers of the widest kind.
+/// Outputs that are accumulated at once. With two vectors each, they fill the registers of processors with the widest vectors.
 const BLOCK: usize = 10;
 
 /// One feature of all rows of a panel, on cache lines of its own.
@@ -21,7 +21,7 @@ pub struct Feature(pub [f32; PANEL]);
 unsafe impl bytemuck::Zeroable for Feature {}
 unsafe impl bytemuck::Pod for Feature {}
 
-/// Buffers of a forward pass, to be used again. They grow, and never shrink.
+/// Reusable buffers of a forward pass. They only grow.
 #[derive(Debug, Default)]
 pub struct Panels {
     x: Vec<Feature>,
@@ -29,7 +29,7 @@ pub struct Panels {
 }
 
 impl Panels {
-    /// Where the features go that a network is to be given. What stands in places that are not filled is nobody's.
+    /// Where a network's input goes. Rows that are not filled hold arbitrary numbers.
     pub fn input(&mut self, features: usize) -> &mut [Feature] {
         grow(&mut self.x, features);
         &mut self.x[..features]
@@ -42,14 +42,14 @@ fn grow(panel: &mut Vec<Feature>, features: usize) {
     }
 }
 
-/// A multi-layer perceptron that only predicts.
+/// A multi-layer perceptron for inference.
 #[derive(Clone, Debug)]
 pub struct FrozenMlp {
     layers: Vec<Layer>,
     activation: Activation,
 }
 
-/// Weights and biases in blocks of outputs; those beyond the last output are zero.
+/// Weights and biases in blocks of outputs, padded with zeros.
 #[derive(Clone, Debug)]
 struct Layer {
     input: usize,
@@ -68,12 +68,12 @@ impl FrozenMlp {
         Self { layers, activation }
     }
 
-    /// Features that go in.
+    /// Input features.
     pub fn inputs(&self) -> usize {
         self.layers[0].input
     }
 
-    /// Features that come out.
+    /// Output features.
     pub fn outputs(&self) -> usize {
         self.layers[self.layers.len() - 1].output
     }
@@ -83,7 +83,7 @@ impl FrozenMlp {
         self.layers.iter().map(|layer| (layer.weight(), layer.bias.as_flattened()[..layer.output].to_vec()))
     }
 
-    /// What the network makes of the [input](Panels::input).
+    /// The network's output for the [input](Panels::input).
     pub fn forward<'a>(&self, panels: &'a mut Panels) -> &'a [Feature] {
         let Panels { x, y } = panels;
         let (head, hidden) = self.layers.split_last().expect("a network has layers");

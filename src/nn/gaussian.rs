@@ -1,4 +1,4 @@
-//! The Gaussians that policies act by: SAC's, squashed (`a = tanh(u)`, `u ~ N(mean, std^2)`), and DreamerV3's, bounded.
+//! The Gaussian policies: SAC's, squashed by a tanh (`a = tanh(u)`, `u ~ N(mean, std^2)`), and DreamerV3's, bounded.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -6,11 +6,13 @@ use dfdx::tensor::Cpu;
 use super::kernels::{sigmoid, tanh};
 use super::{Tensor2, Tensor3};
 
-/// Log standard deviations are squashed into this range, so that their gradient never dies as it
-/// does at a hard clamp (as CleanRL does; SB3 clamps to [-20, 2]).
+/// Log standard deviations are squashed into this range, so that their gradient does not vanish as it does at a hard clamp (as
+/// CleanRL does; SB3 clamps to [-20, 2]).
 const LOG_STD: [f32; 2] = [-5.0, 2.0];
 
-/// The distribution that a policy network's output describes.
+/// SAC's policy distribution (Haarnoja et al. 2018, appendix C): a Gaussian squashed by a tanh.
+#[doc(alias = "tanh Gaussian")]
+#[derive(Clone, Debug)]
 pub struct SquashedGaussian<T: Tape<f32, Cpu>> {
     /// Mean of u, `[1, batch, actions]`.
     pub mean: Tensor3<T>,
@@ -19,7 +21,7 @@ pub struct SquashedGaussian<T: Tape<f32, Cpu>> {
 }
 
 impl<T: Tape<f32, Cpu>> SquashedGaussian<T> {
-    /// Reads the head of a policy: `[1, batch, 2 actions]`, means first.
+    /// The distribution of a policy's head `[1, batch, 2 actions]`, means first.
     pub fn from_head(head: Tensor3<T>) -> Self {
         let &(_, _, width) = head.shape();
         let actions = width / 2;
@@ -30,11 +32,11 @@ impl<T: Tape<f32, Cpu>> SquashedGaussian<T> {
         Self { mean, log_std }
     }
 
-    /// The action for standard normal `noise` (`[1, batch, actions]`), and its log-density summed over
-    /// the action's numbers, `[1, batch]`. Differentiable in the head (reparameterised).
+    /// The action `[1, batch, actions]` for standard normal `noise` (`[1, batch, actions]`), and its log-density summed over
+    /// the action's numbers, `[1, batch]`. Differentiable in the head (reparameterisation trick).
     ///
-    /// The log-density carries the tape back to the head; the action's own tape begins at u. A loss in which
-    /// both occur has all of it.
+    /// The log-density carries the tape back to the head; the action's own tape begins at u. A loss that contains both has
+    /// the whole gradient.
     ///
     /// ln(1 - tanh(u)^2) is computed as 2 (ln 2 - u - softplus(-2u)), which is exact where the usual
     /// ln(1 - a^2 + 1e-6) saturates.
@@ -50,29 +52,29 @@ impl<T: Tape<f32, Cpu>> SquashedGaussian<T> {
         (action, (gaussian - squash).sum::<(usize, usize), Axis<2>>())
     }
 
-    /// The action at the mean: what a policy does when it is judged.
+    /// The action at the mean, `[1, batch, actions]`: the deterministic policy of evaluations.
     pub fn mode(self) -> Tensor3<T> {
         self.mean.tanh()
     }
 }
 
-/// The bounded Gaussian of DreamerV3 for one number of an action: the mean lies in (-1, 1), the deviation between two
-/// bounds. What is drawn is not squashed; the world cuts it off.
+/// DreamerV3's policy distribution for one number of an action: a Gaussian with its mean in (-1, 1) and its standard deviation
+/// between two bounds. Samples are not squashed; the environment clips them to [-1, 1].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BoundedNormal {
     /// The mean, `tanh(raw)`.
     pub mean: f32,
     /// The standard deviation, `(high - low) sigmoid(raw + 2) + low`.
     pub std: f32,
-    /// The slopes of mean and deviation with respect to the raw numbers.
+    /// The derivatives of mean and standard deviation with respect to the raw numbers.
     slopes: [f32; 2],
 }
 
 impl BoundedNormal {
-    /// The largest deviation.
+    /// The largest standard deviation.
     const HIGH: f32 = 1.0;
 
-    /// The distribution that two raw numbers of a policy's head describe; no deviation is smaller than `low`.
+    /// The distribution of two raw numbers of a policy's head; `low` is the smallest standard deviation.
     pub fn new(raw_mean: f32, raw_std: f32, low: f32) -> Self {
         let mean = tanh(raw_mean);
         let share = sigmoid(raw_std + 2.0);
@@ -80,7 +82,7 @@ impl BoundedNormal {
         Self { mean, std: range * share + low, slopes: [1.0 - mean * mean, range * share * (1.0 - share)] }
     }
 
-    /// Logarithm of the density at `action`.
+    /// The log-density at `action`.
     pub fn log_density(&self, action: f32) -> f32 {
         let z = (action - self.mean) / self.std;
         -0.5 * (z * z + (2.0 * std::f32::consts::PI).ln()) - self.std.ln()
@@ -91,8 +93,8 @@ impl BoundedNormal {
         0.5 * (1.0 + (2.0 * std::f32::consts::PI).ln()) + self.std.ln()
     }
 
-    /// The slopes of `density weight * log density + entropy weight * entropy` with respect to the raw mean and the raw
-    /// deviation.
+    /// The derivatives of `of_density * log_density(action) + of_entropy * entropy` with respect to the raw mean and the raw
+    /// standard deviation.
     pub fn slopes(&self, action: f32, of_density: f32, of_entropy: f32) -> [f32; 2] {
         let z = (action - self.mean) / self.std;
         let [mean, std] = self.slopes;

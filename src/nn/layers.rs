@@ -13,11 +13,11 @@ use crate::rng::{self, Rng};
 /// The shape of an [`Mlp`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MlpConfig {
-    /// Networks side by side.
+    /// Networks in parallel.
     pub members: usize,
     /// Input features.
     pub input: usize,
-    /// Width of each hidden layer.
+    /// Units of each hidden layer.
     pub hidden: Vec<usize>,
     /// Output features of the last, affine layer; without one, the last hidden layer is the output.
     pub output: Option<usize>,
@@ -29,13 +29,13 @@ pub struct MlpConfig {
     pub init: Init,
 }
 
-/// How the rows of a hidden layer are normalised.
+/// How each row of a hidden layer is normalised.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Norm {
     /// Not at all.
     None,
-    /// To mean 0 and deviation 1: [`norm::layer_norm`].
+    /// To mean 0 and standard deviation 1: [`norm::layer_norm`].
     Layer,
     /// To a root mean square of 1: [`norm::rms_norm`].
     Rms,
@@ -47,17 +47,17 @@ pub enum Norm {
 pub enum Init {
     /// Weights and biases uniform in +-1/sqrt(n), as in PyTorch.
     Uniform,
-    /// Weights normal with deviation 1 / (2 sqrt(n)), cut off at two deviations; biases zero: as in PETS.
+    /// Weights normal with standard deviation 1 / (2 sqrt(n)), truncated at two standard deviations; biases zero: as in PETS.
     TruncatedNormal,
-    /// Weights normal and cut off at two deviations, with deviation 1 / sqrt(n) after the cut; biases zero: as in
-    /// DreamerV3.
+    /// Weights normal and truncated at two standard deviations, with standard deviation 1 / sqrt(n) after truncation; biases
+    /// zero: as in DreamerV3.
     Lecun,
 }
 
 impl Init {
     /// The numbers of a weight of `inputs` rows, or of a bias.
     pub(crate) fn draw(self, count: usize, inputs: usize, is_bias: bool, rng: &mut Rng) -> Vec<f32> {
-        // The deviation of a standard normal number that is cut off at two deviations.
+        // The standard deviation of a standard normal number that is truncated at +-2.
         const TRUNCATED: f64 = 0.879_625_661_034_239_8;
         let bound = 1.0 / (inputs as f64).sqrt();
         let number = |_| match self {
@@ -92,7 +92,7 @@ enum NormParameters {
 }
 
 impl Mlp {
-    /// New networks.
+    /// New networks with random parameters.
     pub fn new(cpu: &Cpu, config: &MlpConfig, rng: &mut Rng) -> Self {
         let sizes: Vec<usize> =
             [config.input].into_iter().chain(config.hidden.iter().copied()).chain(config.output).collect();
@@ -133,7 +133,7 @@ impl Mlp {
         Self::new(cpu, &config, rng)
     }
 
-    /// Multiplies the weights of the last layer by `factor`: with 0, the network says the same of everything at first.
+    /// Multiplies the weights of the last layer by `factor`: with 0, the output is the same for every input at first.
     pub fn scale_output(mut self, factor: f32) -> Self {
         let last = self.layers.last_mut().expect("a layer");
         values_mut(&mut last.weight).iter_mut().for_each(|w| *w *= factor);
@@ -158,8 +158,8 @@ impl Mlp {
         Self { layers: (0..members[0].len()).map(layer).collect() }
     }
 
-    /// Weight `[input, output]` and bias `[output]` of each layer of one network, without tape: what planners run on.
-    /// Layer normalisation is not among them.
+    /// Weight `[input, output]` and bias `[output]` of each layer of one network, without normalisation: what planners run
+    /// on.
     pub fn layers_of(&self, member: usize) -> impl Iterator<Item = (&[f32], &[f32])> {
         let of_member = move |parameter| {
             let numbers = values(parameter);
@@ -169,7 +169,7 @@ impl Mlp {
         self.layers.iter().map(move |layer| (of_member(&layer.weight), of_member(&layer.bias)))
     }
 
-    /// One of the networks, on its own. Layer normalisation does not come along.
+    /// One of the networks on its own, without normalisation.
     pub fn member(&self, cpu: &Cpu, member: usize) -> Self {
         let layers = self.layers_of(member).map(|(weight, bias)| (weight.to_vec(), bias.to_vec())).collect();
         Self::from_layers(cpu, &[layers], self.layers[0].activation)

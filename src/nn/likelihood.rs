@@ -1,4 +1,4 @@
-//! The likelihood of a Gaussian whose log-variance is softly bounded: the loss of PETS (Chua et al. 2018).
+//! The negative log-likelihood of a Gaussian whose log-variance is softly bounded: the loss of PETS (Chua et al. 2018).
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -11,7 +11,7 @@ use super::ops::{Grad, Tensor3, take, values};
 /// Weight of the penalty that draws learned bounds together.
 const BOUND_PENALTY: f32 = 0.01;
 
-/// The range of log-variances, for each output: `[1, 1, outputs]`, the same for all networks of a loss.
+/// Bounds of the log-variances, for each output: `[1, 1, outputs]`, the same for all networks of a loss.
 #[derive(Clone, Debug)]
 pub struct LogVarianceBounds {
     /// Upper bounds.
@@ -56,12 +56,14 @@ pub(crate) fn bounded_variance(raw: f32, least_precision: f32, least_variance: f
 /// `mean over batch and outputs of (mean - target)^2 exp(-v) + v`, v the bounded log-variance.
 /// If the bounds are trained, `0.01 (sum(max) - sum(min))` comes on top.
 ///
-/// With `beta` above zero each number's loss is weighed by its own predicted variance to that power, as a constant
-/// (beta-NLL, Seitzer et al. 2022). Without, a network may call what it cannot yet predict chance, and then learns
-/// no more about it, because a large variance takes the weight from the error.
+/// With `beta` above zero the loss of each number is weighted by sg(variance^beta), its own predicted variance under a
+/// stop-gradient (beta-NLL, Seitzer et al. 2022). Without, a network may explain what it cannot predict yet as noise, and then
+/// stops learning it, because a large variance takes the weight from the error.
 ///
-/// `head` is `[members, batch, 2 outputs]`, means first; `targets` `[members, batch, outputs]`. The answer is
-/// `[1, 1, 1]`.
+/// `head` is `[members, batch, 2 outputs]`, means first; `targets` `[members, batch, outputs]`. The result is `[1, 1, 1]`. The
+/// bounds are trained if `grad` is [`Grad::Both`].
+#[doc(alias = "Gaussian NLL")]
+#[doc(alias = "negative log-likelihood")]
 pub fn bounded_nll<T: Tape<f32, Cpu>>(
     head: Tensor3<T>,
     targets: &Tensor3,

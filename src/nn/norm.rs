@@ -1,4 +1,14 @@
 //! Normalisation over the features of each row, with the activation that follows it: one step on the tape.
+//!
+//! ```
+//! use handful::nn::{Activation, Grad, device, norm, tensor, values};
+//!
+//! let x = tensor(&device(), vec![3.0, -4.0], (1, 1, 2));
+//! let gain = tensor(&device(), vec![1.0, 1.0], (1, 1, 2));
+//! let y = norm::rms_norm(x, &gain, Activation::Identity, Grad::Input);
+//! let square: f32 = values(&y).iter().map(|y| y * y).sum();
+//! assert!((square / 2.0 - 1.0).abs() < 1e-4);
+//! ```
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -9,7 +19,9 @@ use super::parameters::Parameters;
 use super::tape::TapeOps;
 
 /// Layer normalisation (Ba et al. 2016), then the activation:
-/// `activation(gain (x - mean) / sqrt(variance + 1e-5) + shift)`; gain and shift `[members, 1, features]`.
+/// `activation(gain (x - mean) / sqrt(variance + 1e-5) + shift)`; x `[members, batch, features]`, gain and shift
+/// `[members, 1, features]`. Gradients flow to the input always, to gain and shift unless `grad` is [`Grad::Input`].
+#[doc(alias = "LayerNorm")]
 pub fn layer_norm<T: Tape<f32, Cpu>>(
     x: Tensor3<T>,
     gain: &Tensor3,
@@ -21,12 +33,14 @@ pub fn layer_norm<T: Tape<f32, Cpu>>(
 }
 
 /// Root-mean-square normalisation (Zhang & Sennrich 2019), then the activation:
-/// `activation(gain x / sqrt(mean(x^2) + 1e-4))`; gain `[members, 1, features]`. The epsilon is DreamerV3's.
+/// `activation(gain x / sqrt(mean(x^2) + 1e-4))`; x `[members, batch, features]`, gain `[members, 1, features]`. The epsilon
+/// is DreamerV3's. Gradients flow as in [`layer_norm`].
+#[doc(alias = "RMSNorm")]
 pub fn rms_norm<T: Tape<f32, Cpu>>(x: Tensor3<T>, gain: &Tensor3, activation: Activation, grad: Grad) -> Tensor3<T> {
     normalised(x, gain, None, Rule { centred: false, epsilon: 1e-4, activation }, grad)
 }
 
-/// A learned [`rms_norm`] with a SiLU after it, for layers that are no part of an [`super::Mlp`].
+/// A learned [`rms_norm`] with a SiLU after it, for layers outside an [`super::Mlp`].
 #[derive(Clone, Debug)]
 pub struct RmsNorm {
     gain: Tensor3,
@@ -83,7 +97,7 @@ fn normalised<T: Tape<f32, Cpu>>(
     let of_member = move |gain: &Tensor3, member: usize| values(gain)[member * features..][..features].to_vec();
 
     let mut y = vec![0.0; members * batch * features];
-    // Of each row its mean and 1/deviation, from which the gradient finds everything else again.
+    // Mean and 1 / standard deviation of each row, from which the gradient computes everything else again.
     let mut statistics = vec![[0.0; 2]; members * batch];
     if !y.is_empty() {
         let rows = values(&x).chunks_exact(batch * features).zip(y.chunks_exact_mut(batch * features));

@@ -1,53 +1,28 @@
 //! Operations that dfdx's tape records as one step each, with gradients of our own.
 //!
 //! dfdx differentiates; these kernels calculate. A fused layer saves dfdx's separate elementwise
-//! passes and uses both cores. Every gradient here is checked against finite differences.
+//! passes and uses all cores. Every gradient here is checked against finite differences.
+//!
+//! ```
+//! use handful::nn::dfdx::prelude::*;
+//! use handful::nn::{Activation, Grad, device, ops, tensor, values};
+//!
+//! // relu(x w + b), differentiated with respect to w and b but not to x.
+//! let x = tensor(&device(), vec![1.0, 2.0], (1, 1, 2));
+//! let (w, b) = (tensor(&device(), vec![0.5, 0.25], (1, 2, 1)), tensor(&device(), vec![0.0], (1, 1, 1)));
+//! let y = ops::dense(x.clone().leaky_traced(), &w, &b, Activation::Relu, Grad::Params);
+//! assert_eq!(values(&y), [1.0]);
+//! let mut gradients = y.sum::<Rank0, _>().backward();
+//! assert_eq!(**gradients.get_or_alloc_mut(&w)?, [1.0, 2.0]);
+//! assert_eq!(**gradients.get_or_alloc_mut(&x)?, [0.0, 0.0]);
+//! # Ok::<(), dfdx::tensor::CpuError>(())
+//! ```
 
 use dfdx::prelude::*;
 use dfdx::tensor::{Cpu, CpuError, Gradients};
 
 use super::kernels::{self, Activation, DenseShape};
-
-/// Features of several networks, `[members, batch, features]`; also parameters, see [`dense`].
-pub type Tensor3<T = NoneTape> = Tensor<(usize, usize, usize), f32, Cpu, T>;
-/// One number for each row of each network, `[members, batch]`.
-pub type Tensor2<T = NoneTape> = Tensor<(usize, usize), f32, Cpu, T>;
-/// The numbers of a tensor, in row-major order, without copying them.
-///
-/// # Panics
-/// If the tensor is a broadcast or permuted view.
-pub fn values<T>(tensor: &Tensor3<T>) -> &[f32] {
-    let &(members, batch, features) = tensor.shape();
-    let len = members * batch * features;
-    if len == 0 {
-        return &[];
-    }
-    let at = |index: [usize; 3]| std::ptr::from_ref(&tensor[index]);
-    let (first, last) = (at([0; 3]), at([members - 1, batch - 1, features - 1]));
-    let second_row = if batch > 1 { features } else { 0 };
-    assert!(
-        last == first.wrapping_add(len - 1) && at([0, batch.min(2) - 1, 0]) == first.wrapping_add(second_row),
-        "a contiguous tensor"
-    );
-    // SAFETY: a dfdx tensor on the Cpu keeps its numbers in one `Vec<f32>` (`CachableVec`), which it
-    // hands out by element only. The assertion has just shown that the first and the last of `len`
-    // elements stand `len - 1` apart in it; the tensor is borrowed as long as the slice.
-    unsafe { std::slice::from_raw_parts(first, len) }
-}
-
-/// The same, to be changed. Numbers that the tensor shares with its clones are copied first.
-///
-/// # Panics
-/// If the tensor is a broadcast or permuted view.
-pub fn values_mut(tensor: &mut Tensor3) -> &mut [f32] {
-    let len = values(tensor).len();
-    if len == 0 {
-        return &mut [];
-    }
-    let first = std::ptr::from_mut(&mut tensor[[0; 3]]);
-    // SAFETY: as in `values`; dfdx's `IndexMut` has just made the tensor the only owner of its numbers.
-    unsafe { std::slice::from_raw_parts_mut(first, len) }
-}
+pub use super::tensors::{Tensor2, Tensor3, values, values_mut};
 
 /// Takes the gradient of an operation's result out of the store; nothing else will need it.
 pub(crate) fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<Vec<f32>, CpuError> {
@@ -86,7 +61,7 @@ pub fn dense<T: Tape<f32, Cpu>>(
     let shape = DenseShape { members, batch, input, output, shared_input: x_members == 1 };
 
     let mut y = vec![0.0; members * batch * output];
-    // The gradient of a ReLU can be told from its result, that of a SiLU cannot.
+    // The gradient of a ReLU follows from its result, that of a SiLU does not.
     let mut before = (T::OWNS_TAPE && activation == Activation::Silu).then(|| vec![0.0; y.len()]);
     kernels::dense(&mut y, before.as_deref_mut(), values(&x), values(w), values(b), shape, activation);
     let y = x.device().tensor_from_vec(y, (members, batch, output));
@@ -156,8 +131,7 @@ pub fn join<T: Tape<f32, Cpu> + Merge<R>, R: Tape<f32, Cpu>>(a: Tensor3<T>, b: T
     y.put_tape(tape)
 }
 
-/// Records an operation on a tape that is handed on from one to the next: in a loop over time, where a result is used
-/// several times, that is simpler than tensors which each carry a tape of their own.
+/// Records an operation on a tape that is handed on from one operation to the next, see [`super::tape`].
 pub fn record<T: Tape<f32, Cpu>>(
     tape: &mut T,
     x: &Tensor3,
@@ -208,7 +182,7 @@ pub fn stack<T: Tape<f32, Cpu>>(mut tape: T, parts: &[Tensor3]) -> Tensor3<T> {
     y.put_tape(tape)
 }
 
-/// Multiplies every row of a single network's tensor by a number of its own.
+/// Multiplies each row of a single network's tensor `[1, batch, features]` by its own factor.
 pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(_, batch, features) = x.shape();
@@ -230,8 +204,8 @@ pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<
     y.put_tape(tape)
 }
 
-/// A function of each row, `[members, batch, outputs]`: `f(row's number, row, value, jacobian)` writes its value and its Jacobian
-/// `[outputs, features]`. Whatever knows its own derivatives joins the tape here: a loss, or a simulator.
+/// A function of each row, `[members, batch, outputs]`: `f(row's index, row, value, jacobian)` writes its value and its
+/// Jacobian `[outputs, features]`. For functions that know their own derivatives: a loss, or a simulator.
 pub fn map_rows<T: Tape<f32, Cpu>>(
     x: Tensor3<T>,
     outputs: usize,
@@ -263,8 +237,8 @@ pub fn map_rows<T: Tape<f32, Cpu>>(
     y.put_tape(tape)
 }
 
-/// Gates what stands in the first third of each row, `[members, batch, 3 n]`, by the sigmoid of what stands in the last; the
-/// second stays as it is: `[members, batch, 2 n]`.
+/// Multiplies the first third of each row `[members, batch, 3 n]` by the sigmoid of the last third; the second third stays as
+/// it is: `[members, batch, 2 n]`.
 pub fn gated<T: Tape<f32, Cpu>>(x: Tensor3<T>) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(members, batch, width) = x.shape();
@@ -303,13 +277,13 @@ pub fn gate_rows(rows: &mut Vec<f32>, n: usize) {
     rows.truncate(2 * n * count);
 }
 
-/// A number for each row, `[members, batch, 1]`: `loss(row's number, row, slope)` returns it and writes its gradient with
-/// respect to the row into `slope`. Losses with a short gradient of their own are best written so.
+/// A loss of each row, `[members, batch, 1]`: `loss(row's index, row, slope)` returns it and writes its gradient with respect
+/// to the row into `slope`.
 pub fn rowwise<T: Tape<f32, Cpu>>(x: Tensor3<T>, mut loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3<T> {
     map_rows(x, 1, |i, row, value, slope| value[0] = loss(i, row, slope))
 }
 
-/// The squared distance of each row from the same row of `target`, `[members, batch, 1]`.
+/// The squared distance of each row from the same row of `target`, summed over features: `[members, batch, 1]`.
 pub fn squared_distance<T: Tape<f32, Cpu>>(x: Tensor3<T>, target: &Tensor3) -> Tensor3<T> {
     assert_eq!(x.shape(), target.shape(), "a target for each number");
     let (target, width) = (values(target), target.shape().2);

@@ -1,4 +1,4 @@
-//! What learns: named parameters, and what is done with all of them at once.
+//! Named parameters of modules, and operations on all of them at once.
 
 use dfdx::shapes::HasShape;
 
@@ -7,15 +7,18 @@ use super::ops::{Tensor3, values, values_mut};
 use crate::checkpoint::Weights;
 use crate::error::Result;
 
-/// Something with named parameters, each `[members, rows, columns]`.
+/// A module with named parameters, each `[members, rows, columns]`.
 pub trait Parameters {
     /// The parameters, in a fixed order.
     fn parameters(&self) -> Vec<(String, &Tensor3)>;
-    /// The same, to be changed.
+    /// The same, mutable.
     fn parameters_mut(&mut self) -> Vec<(String, &mut Tensor3)>;
 }
 
-/// Moves `target` towards `source`: `target <- (1 - rate) target + rate source`.
+/// Moves `target` towards `source` by Polyak averaging: `target <- (1 - rate) target + rate source`.
+#[doc(alias = "target network")]
+#[doc(alias = "EMA")]
+#[doc(alias = "Polyak averaging")]
 pub fn polyak<P: Parameters>(target: &mut P, source: &P, rate: f32) {
     for ((_, target), (_, source)) in target.parameters_mut().into_iter().zip(source.parameters()) {
         kernels::vectorised(|| {

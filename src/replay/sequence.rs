@@ -7,7 +7,7 @@ use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::rng::Rng;
 
-/// A moment of an episode, as sequence models see it: what was observed, and what had come of it so far.
+/// Where in an episode a time step is.
 #[derive(Clone, Copy, Debug)]
 struct Flags {
     first: bool,
@@ -15,40 +15,44 @@ struct Flags {
     terminal: bool,
 }
 
-/// Pieces of experience, `length` moments of `sequences` stretches: numbers of one moment stand together, the moments one
-/// after the other (`[length, sequences, ...]`). A stretch may begin and end anywhere, and may hold the end of one episode
-/// and the beginning of the next.
+/// A batch of subsequences of experience, time-major: every field is `[length, sequences, ...]`. A sequence may start and end
+/// anywhere, and may contain the end of one episode and the start of the next.
+///
+/// As in DreamerV3, a time step holds an observation, the action taken *there*, and the reward for *arriving* there.
 #[derive(Clone, Debug, Default)]
 pub struct SequenceBatch {
-    /// Stretches side by side.
+    /// Sequences in parallel.
     pub sequences: usize,
-    /// Moments in each.
+    /// Time steps of each sequence.
     pub length: usize,
-    /// What was observed.
+    /// Observations, `[length, sequences, observation]`.
     pub obs: Vec<f32>,
-    /// What was done there; zeros at the end of an episode.
+    /// Actions, `[length, sequences, action]`; zeros at the last time step of an episode.
     pub actions: Vec<f32>,
-    /// The reward for having arrived there; zero at the start of an episode.
+    /// Rewards for arriving at each time step, `[length, sequences]`; zero at the first time step of an episode.
     pub rewards: Vec<f32>,
-    /// Whether an episode starts there.
+    /// Whether an episode starts there (`is_first`), `[length, sequences]`.
     pub first: Vec<bool>,
-    /// Whether an episode ends there, by the clock or by itself.
+    /// Whether an episode ends there (`is_last`), by the time limit or by itself, `[length, sequences]`.
     pub last: Vec<bool>,
-    /// Whether the task itself ends there.
+    /// Whether the task itself ends there (`is_terminal`), `[length, sequences]`.
     pub terminal: Vec<bool>,
 }
 
 impl SequenceBatch {
-    /// The last `moments` of each stretch.
-    pub fn last(&self, moments: usize) -> Self {
-        let rows = moments * self.sequences;
+    /// The last `length` time steps of each sequence.
+    ///
+    /// # Panics
+    /// If the sequences are shorter.
+    pub fn last(&self, length: usize) -> Self {
+        let rows = length * self.sequences;
         fn end<T: Clone>(all: &[T], rows: usize, of: usize) -> Vec<T> {
             all[all.len() - all.len() / of * rows..].to_vec()
         }
         let of = self.length * self.sequences;
         Self {
             sequences: self.sequences,
-            length: moments,
+            length,
             obs: end(&self.obs, rows, of),
             actions: end(&self.actions, rows, of),
             rewards: end(&self.rewards, rows, of),
@@ -59,31 +63,32 @@ impl SequenceBatch {
     }
 }
 
-/// All experience, in the order of time.
+/// A replay buffer of whole episodes in the order of time, which samples subsequences.
+#[doc(alias = "replay buffer")]
 #[derive(Clone, Debug)]
 pub struct SequenceReplay {
     observation_size: usize,
     action_size: usize,
     capacity: usize,
-    /// One row a moment: obs, action, reward, first, last, terminal.
+    /// One row for each time step: obs, action, reward, first, last, terminal.
     rows: Vec<f32>,
-    /// Where the oldest row stands, once the buffer is full.
+    /// Index of the oldest row, once the buffer is full.
     oldest: usize,
-    /// The reward for arriving at the moment that comes next; none at the start of an episode.
-    arrived: Option<f32>,
+    /// The reward for arriving at the next time step; none at the start of an episode.
+    arrival_reward: Option<f32>,
 }
 
 impl SequenceReplay {
-    /// A buffer for `capacity` moments.
+    /// A buffer for `capacity` time steps.
     pub fn new(observation_size: usize, action_size: usize, capacity: usize) -> Self {
-        Self { observation_size, action_size, capacity, rows: Vec::new(), oldest: 0, arrived: None }
+        Self { observation_size, action_size, capacity, rows: Vec::new(), oldest: 0, arrival_reward: None }
     }
 
     fn width(&self) -> usize {
         self.observation_size + self.action_size + 4
     }
 
-    /// Moments held: one more than steps in each episode.
+    /// Time steps held: for each episode one more than it has actions.
     pub fn len(&self) -> usize {
         self.rows.len() / self.width()
     }
@@ -93,24 +98,29 @@ impl SequenceReplay {
         self.rows.is_empty()
     }
 
-    /// Adds a step of the present episode.
+    /// Adds a step of the current episode; the oldest time steps make room if the buffer is full.
     ///
     /// # Panics
     /// If observation or action have the wrong length.
     pub fn push(&mut self, t: &Transition) {
         assert!(t.obs.len() == self.observation_size && t.action.len() == self.action_size, "sizes of this buffer");
-        let first = self.arrived.is_none();
-        let reward = self.arrived.unwrap_or(0.0);
-        self.push_moment(&t.obs, &t.action, reward, Flags { first, last: false, terminal: false });
-        self.arrived = Some(t.reward);
+        let first = self.arrival_reward.is_none();
+        let reward = self.arrival_reward.unwrap_or(0.0);
+        self.push_time_step(&t.obs, &t.action, reward, Flags { first, last: false, terminal: false });
+        self.arrival_reward = Some(t.reward);
         if t.terminated || t.truncated {
-            let rest = vec![0.0; self.action_size];
-            self.push_moment(&t.next_obs, &rest, t.reward, Flags { first: false, last: true, terminal: t.terminated });
-            self.arrived = None;
+            let no_action = vec![0.0; self.action_size];
+            self.push_time_step(
+                &t.next_obs,
+                &no_action,
+                t.reward,
+                Flags { first: false, last: true, terminal: t.terminated },
+            );
+            self.arrival_reward = None;
         }
     }
 
-    fn push_moment(&mut self, obs: &[f32], action: &[f32], reward: f32, flags: Flags) {
+    fn push_time_step(&mut self, obs: &[f32], action: &[f32], reward: f32, flags: Flags) {
         let flags = [flags.first, flags.last, flags.terminal].map(f32::from);
         let row = obs.iter().chain(action).chain([&reward]).chain(&flags).copied();
         if self.len() < self.capacity {
@@ -123,10 +133,10 @@ impl SequenceReplay {
         }
     }
 
-    /// Draws stretches of `length` moments, each start as likely as any other.
+    /// Samples subsequences of `length` time steps with uniformly random starts.
     ///
     /// # Panics
-    /// If there are not so many moments.
+    /// If the buffer holds fewer than `length` time steps.
     pub fn sample(&self, sequences: usize, length: usize, rng: &mut Rng) -> SequenceBatch {
         assert!(self.len() >= length && length > 0, "enough to draw from");
         let (count, width) = (self.len(), self.width());
@@ -138,7 +148,7 @@ impl SequenceReplay {
                 let (obs, rest) = row(start + t).split_at(self.observation_size);
                 let (action, rest) = rest.split_at(self.action_size);
                 let [reward, first, last, terminal] = rest else { unreachable!("four numbers") };
-                // An episode that a crash cut short has no last moment; what follows it begins anew.
+                // An episode that a crash cut short has no last time step: the one before the next start is its last.
                 let cut = start + t + 1 < count && row(start + t + 1)[width - 3] > 0.5;
                 batch.obs.extend(obs);
                 batch.actions.extend(action);
@@ -157,17 +167,17 @@ impl SequenceReplay {
         weights.insert_counts(format!("{prefix}.oldest"), &[self.oldest as u64]);
     }
 
-    /// Reads what [`SequenceReplay::save`] wrote; the present episode starts anew.
+    /// Reads what [`SequenceReplay::save`] wrote; the current episode is not continued.
     ///
     /// # Errors
-    /// If it is missing, or of moments of other sizes.
+    /// If it is missing, or of time steps of other sizes.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let name = format!("{prefix}.rows");
         let [_, count, _] = weights.shape(&name)?;
         let rows = weights.get(&name, [1, count, self.width()])?.to_vec();
         self.oldest = weights.counts(&format!("{prefix}.oldest"), 1)?[0] as usize;
         self.rows = rows;
-        self.arrived = None;
+        self.arrival_reward = None;
         Ok(())
     }
 }

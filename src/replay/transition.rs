@@ -1,4 +1,4 @@
-//! Single transitions in a ring buffer, drawn uniformly: what SAC and PETS learn from.
+//! Single transitions in a ring buffer, sampled uniformly: what SAC and PETS learn from.
 
 use rand::RngExt;
 
@@ -6,26 +6,25 @@ use crate::checkpoint::Weights;
 use crate::error::{Error, Result};
 use crate::rng::Rng;
 
-/// One step of experience. Observations and action may belong to any environment.
+/// One step of experience in any environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Transition {
     /// The observation before the step.
     pub obs: Vec<f32>,
-    /// The action, as the agent chose it.
+    /// The action, as the agent chose it, each number in [-1, 1].
     pub action: Vec<f32>,
     /// The reward of the step.
     pub reward: f32,
-    /// The observation after the step: at the end of an episode its last one, never the first of the
-    /// next episode.
+    /// The observation after the step: at the end of an episode its last one, not the first of the next episode.
     pub next_obs: Vec<f32>,
-    /// The task itself ended. An end by the clock does not count: its future is valued from
-    /// `next_obs` like any other.
+    /// Whether the step ended the task itself, so that there is no future to bootstrap from. After the time limit there is:
+    /// `next_obs` has a value like any other.
     pub terminated: bool,
-    /// The clock ended the episode.
+    /// Whether the time limit ended the episode.
     pub truncated: bool,
 }
 
-/// A transition as the buffer holds it.
+/// A transition as the buffer stores it.
 #[derive(Clone, Copy, Debug)]
 pub struct Row<'a> {
     /// The observation before the step.
@@ -40,7 +39,7 @@ pub struct Row<'a> {
     pub terminated: bool,
 }
 
-/// A minibatch: `size` rows in each field, one after the other.
+/// A minibatch of `size` transitions, each field row by row.
 #[derive(Clone, Debug, Default)]
 pub struct Batch {
     /// Rows.
@@ -57,7 +56,9 @@ pub struct Batch {
     pub terminated: Vec<f32>,
 }
 
-/// A ring of the last transitions.
+/// A ring buffer of the latest transitions.
+#[doc(alias = "replay buffer")]
+#[doc(alias = "experience replay")]
 #[derive(Clone, Debug)]
 pub struct ReplayBuffer {
     observation_size: usize,
@@ -65,7 +66,7 @@ pub struct ReplayBuffer {
     capacity: usize,
     /// Where the next transition goes.
     next: usize,
-    /// One row a transition: obs, action, reward, next_obs, terminated.
+    /// One row for each transition: obs, action, reward, next_obs, terminated.
     rows: Vec<f32>,
 }
 
@@ -89,7 +90,7 @@ impl ReplayBuffer {
         self.rows.is_empty()
     }
 
-    /// Adds a transition; the oldest one makes room when the buffer is full.
+    /// Adds a transition, in place of the oldest one if the buffer is full.
     ///
     /// # Panics
     /// If observation or action have the wrong length.
@@ -108,10 +109,10 @@ impl ReplayBuffer {
         self.next = (self.next + 1) % self.capacity;
     }
 
-    /// The `i`th transition in memory; once the buffer is full, that is not the order of time.
+    /// The transition at index `i`. Once the buffer is full, indices are not in the order of time.
     ///
     /// # Panics
-    /// If there are not so many.
+    /// If `i` is not below [`ReplayBuffer::len`].
     pub fn row(&self, i: usize) -> Row<'_> {
         let width = self.width();
         let (obs, rest) = self.rows[i * width..][..width].split_at(self.observation_size);
@@ -120,7 +121,7 @@ impl ReplayBuffer {
         Row { obs, action, reward, next_obs, terminated }
     }
 
-    /// Draws `size` transitions uniformly, with replacement.
+    /// Samples `size` transitions uniformly, with replacement.
     ///
     /// # Panics
     /// If the buffer is empty.
@@ -147,7 +148,7 @@ impl ReplayBuffer {
     /// Reads what [`ReplayBuffer::save`] wrote.
     ///
     /// # Errors
-    /// If it is missing, or of transitions of other sizes.
+    /// If it is missing, has transitions of other sizes, or more of them than fit.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let name = format!("{prefix}.rows");
         let [_, count, _] = weights.shape(&name)?;

@@ -11,9 +11,9 @@ use crate::plan::{ControlConfig, PlannerConfig};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DreamerConfig {
-    /// The world model.
+    /// Settings of the world model.
     pub world: WorldModelConfig,
-    /// Actor and critic.
+    /// Settings of actor and critic.
     pub behaviour: ActorCriticConfig,
     /// Plans in the latent space of the world model instead of asking the policy, if there is a planner (PlaNet).
     pub planner: Option<PlannerConfig>,

@@ -45,8 +45,8 @@ impl PolicyState {
         self.latent = world.observe(&self.latent, &before, obs, &mut self.rng);
     }
 
-    /// Observes and acts: by the planner if there is one, else by the policy's mean, or with `noise` by so many of its
-    /// standard deviations away from the mean.
+    /// Observes and acts: by the planner if there is one, else by the policy's mean, or with
+    /// `noise` at that many standard deviations from the mean.
     pub fn act(&mut self, networks: &Networks, obs: &[f32], noise: Option<&[f32]>) -> Vec<f32> {
         let Networks { world, behaviour, .. } = networks;
         self.observe(world, obs);

@@ -1,5 +1,5 @@
 //! One update of Dreamer: the world model on replayed sequences, actor and critic on rollouts imagined from them, all by one
-//! optimiser step (Hafner et al. 2023, algorithm 1 of the appendix).
+//! optimiser step.
 
 use dfdx::prelude::*;
 use dfdx::tensor::{Cpu, Gradients};
@@ -13,8 +13,8 @@ use crate::nn::{Parameters, TapeOps, ops, parameters_of_fields};
 use crate::replay::SequenceBatch;
 use crate::rng::{self, Rng};
 
-/// Every batch is cut into so many parts, whose gradients are computed in parallel and averaged. The number is fixed, so that
-/// results do not depend on the machine.
+/// Parts of a batch, whose gradients are computed in parallel and averaged. A fixed number: results do not depend on the
+/// machine.
 pub(super) const PARTS: usize = 2;
 
 /// All networks. The target network is not trained: it follows the critic.

@@ -4,7 +4,8 @@ use super::Pets;
 use crate::agent::{Checkpoint, Diagnostics};
 use crate::checkpoint::Weights;
 use crate::error::Result;
-use crate::model::open_loop::{Episode, OpenLoop, open_loop};
+use crate::model::open_loop::{OpenLoop, open_loop};
+use crate::replay::Episode;
 use crate::rng;
 
 impl Diagnostics for Pets {

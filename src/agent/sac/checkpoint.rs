@@ -7,7 +7,7 @@ use super::temperature::Temperature;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::Weights;
 use crate::error::Result;
-use crate::model::open_loop::Episode;
+use crate::replay::Episode;
 use crate::nn::{Grad, ops, tensor};
 use crate::rng;
 

@@ -49,11 +49,12 @@ pub use config::WorldModelConfig;
 pub use loss::WorldModelLoss;
 
 use super::features::LatentFeatures;
-use super::open_loop::{Episode, OpenLoopModel, actions_from};
+use super::open_loop::{OpenLoopModel, actions_from};
 use super::rssm::{Latent, Rssm};
 use crate::env::Spec;
 use crate::nn::kernels::sigmoid;
 use crate::nn::{Grad, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
+use crate::replay::Episode;
 use crate::rng::Rng;
 
 /// Particles for each start of an open-loop prediction.

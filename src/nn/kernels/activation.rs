@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::math::{silu, silu_slope};
 use super::vectorised_fn;
 
-/// What follows a layer's affine part.
+/// The activation after a layer's affine part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
@@ -14,7 +14,7 @@ pub enum Activation {
     Identity,
     /// max(0, x).
     Relu,
-    /// x sigmoid(x), also called swish: smooth, so that a model of a smooth world has smooth gradients.
+    /// x sigmoid(x), also called swish. It is smooth, so that a learned model has smooth gradients.
     Silu,
 }
 
@@ -54,8 +54,8 @@ pub(crate) fn activate(y: &mut [f32], activation: Activation) {
     }
 }
 
-/// From the gradient of `activation(z)` to the gradient of z, in place. Where only the sign of z matters (ReLU),
-/// `z` may be its activation.
+/// From the gradient of `activation(z)` to the gradient of z, in place. For ReLU, where only the sign of z matters, `z` may be
+/// its activation.
 pub fn through_activation(dy: &mut [f32], z: &[f32], activation: Activation) {
     if activation != Activation::Identity {
         let chunk = dy.len().div_ceil(rayon::current_num_threads()).max(16_384);

@@ -10,23 +10,23 @@ use super::{Activation, Matrix, matmul, vectorised};
 pub struct DenseShape {
     /// Networks.
     pub members: usize,
-    /// Rows that each network is given.
+    /// Rows of each network's input.
     pub batch: usize,
     /// Columns of the input.
     pub input: usize,
     /// Columns of the output.
     pub output: usize,
-    /// Whether all networks are given the same input, which then stands in memory only once.
+    /// Whether all networks have the same input, which is then stored only once.
     pub shared_input: bool,
 }
 
 impl DenseShape {
     /// Rows handed to one thread at a time, so that every core has work.
     fn rows_per_task(&self, rows: usize) -> usize {
-        // Each network is one task if networks can be dealt out evenly; otherwise it is cut into so many that its parts can.
+        // A network is one task if networks divide evenly among threads; otherwise it is cut so that its parts do.
         let threads = rayon::current_num_threads();
         let tasks = (1..=threads).find(|tasks| (tasks * self.members).is_multiple_of(threads)).unwrap_or(1);
-        // Below this much work a second core costs more than it brings.
+        // Below this much work a second core costs more than it saves.
         let enough = 2_000_000 / (self.input * self.output).max(1);
         rows.div_ceil(tasks).max(enough).min(rows).max(1)
     }
@@ -49,8 +49,7 @@ impl DenseShape {
 }
 
 /// `y = activation(x w + b)` for every network: x `[members or 1, batch, input]`,
-/// w `[members, input, output]`, b `[members, output]`, y `[members, batch, output]`. What is activated is kept in
-/// `before`, if that is given.
+/// w `[members, input, output]`, b `[members, output]`, y `[members, batch, output]`. `before`, if given, receives `x w + b`.
 pub fn dense(
     y: &mut [f32],
     before: Option<&mut [f32]>,

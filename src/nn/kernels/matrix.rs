@@ -1,7 +1,7 @@
 //! Matrix products on slices, by `gemm`.
 
 /// A row-major matrix, read as it stands or transposed.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub struct Matrix<'a> {
     data: &'a [f32],
     rows: usize,
@@ -11,7 +11,10 @@ pub struct Matrix<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// `data` as a matrix of so many columns.
+    /// `data` as a matrix of `cols` columns.
+    ///
+    /// # Panics
+    /// If rows would not be of equal length.
     pub fn new(data: &'a [f32], cols: usize) -> Self {
         assert!(cols > 0 && data.len().is_multiple_of(cols), "rows of equal length");
         Self { data, rows: data.len() / cols, cols, row_stride: cols as isize, col_stride: 1 }
@@ -40,8 +43,8 @@ pub fn matmul(out: &mut [f32], a: Matrix, b: Matrix, accumulate: bool) {
     matmul_into(out, b.cols, a, b, accumulate);
 }
 
-/// The same, into some columns of a wider matrix: `out` begins at the product's first number, and its rows lie
-/// `row_stride` apart.
+/// [`matmul`] into some columns of a wider matrix: `out` begins at the product's first number, and its rows are `row_stride`
+/// apart.
 pub fn matmul_into(out: &mut [f32], row_stride: usize, a: Matrix, b: Matrix, accumulate: bool) {
     assert_eq!(a.cols, b.rows, "inner sizes agree");
     if a.rows == 0 || b.cols == 0 {

@@ -25,13 +25,13 @@ pub use math::{exp, sigmoid, softplus, tanh};
 pub(crate) use math::{silu, silu_slope};
 pub use matrix::{Matrix, matmul, matmul_into};
 
-/// Runs a loop compiled for the widest vectors that this processor has, if the compiler sees fit to inline it.
+/// Runs a loop compiled for the widest vectors of this processor, if the compiler inlines it.
 pub fn vectorised<R>(work: impl FnOnce() -> R) -> R {
     pulp::Arch::new().dispatch(work)
 }
 
-/// Defines a function of slices whose loops are compiled for the widest vectors that this processor has. (Of a closure,
-/// which cannot be told to be inlined, the compiler makes a function for the oldest processors once it is long.)
+/// Defines a function of slices whose loops are compiled for the widest vectors of this processor. (A long closure is not
+/// inlined, and then compiled for the oldest processors.)
 macro_rules! vectorised_fn {
     ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $body:block) => {
         $(#[$meta])*
