@@ -7,8 +7,8 @@ use super::temperature::Temperature;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::Weights;
 use crate::error::Result;
-use crate::replay::Episode;
 use crate::nn::{Grad, ops, tensor};
+use crate::replay::Episode;
 use crate::rng;
 
 impl Diagnostics for Sac {
