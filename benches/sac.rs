@@ -42,7 +42,7 @@ fn updates(c: &mut Criterion) {
     group.finish();
 }
 
-/// What the machine can do at these sizes: the bound on everything above.
+/// A matrix product at these sizes: the upper bound on the throughput of everything above.
 fn products(c: &mut Criterion) {
     const N: usize = 256;
     let mut group = c.benchmark_group("matrix product");

@@ -15,10 +15,10 @@ pub trait Parameters {
     fn parameters_mut(&mut self) -> Vec<(String, &mut Tensor3)>;
 }
 
-/// Moves `target` towards `source` by Polyak averaging: `target <- (1 - rate) target + rate source`.
+/// Polyak averaging, by which a target network follows its source: `target <- (1 - rate) target + rate source`.
 #[doc(alias = "target network")]
 #[doc(alias = "EMA")]
-#[doc(alias = "Polyak averaging")]
+#[doc(alias = "soft update")]
 pub fn polyak<P: Parameters>(target: &mut P, source: &P, rate: f32) {
     for ((_, target), (_, source)) in target.parameters_mut().into_iter().zip(source.parameters()) {
         kernels::vectorised(|| {

@@ -17,8 +17,8 @@ pub struct PetsConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
-    /// Weight of the terminal reward: the known reward of resting in a plan's last state is added to its return so many
-    /// times. A short plan then prefers to end well. Without effect if the reward is learned.
+    /// Weight of the terminal reward: this many times the known reward of resting in a plan's last state is added to the
+    /// plan's return, so that a short plan prefers to end well. Without effect if the reward is learned.
     pub terminal_weight: f32,
     /// How uncertainty is propagated along imagined trajectories.
     #[doc(alias = "trajectory sampling")]
