@@ -1,12 +1,14 @@
 //! How far do learned models see? Records episodes, lets an ensemble, an autoencoder and a recurrent state-space model learn
 //! from the same ones, and judges all three on others: `data/foresight/TASK.csv` and `TASK.svg`.
 //!
-//! `cargo run --example foresight` (a few minutes); with names of tasks, only for those.
+//! `cargo run --example foresight` (a few minutes); with names of tasks, only for those; with `draw` before them, only the figures,
+//! from the tables that are there.
 
 use std::error::Error;
 use std::path::Path;
 
 use handful::agent::{DreamerConfig, Preset};
+use handful::chart::{Chart, PALETTE, Panels};
 use handful::env::{Env, Spec, Task, World};
 use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
 use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, WorldModel};
@@ -15,7 +17,7 @@ use handful::plan::noise::ColoredNoise;
 use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng::{self, Rng};
 
-use plotters::prelude::*;
+use plotters::chart::SeriesLabelPosition;
 
 const TRAINING: u64 = 60;
 const HELD_OUT: u64 = 20;
@@ -75,9 +77,9 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Reco
 }
 
 /// A row of the table.
-#[derive(serde::Serialize)]
+#[derive(serde::Deserialize, serde::Serialize)]
 struct Row {
-    model: &'static str,
+    model: String,
     horizon: usize,
     rmse: f64,
     rmse_p90: f64,
@@ -100,11 +102,11 @@ impl<Model: OpenLoopModel> OpenLoopModel for Alike<'_, Model> {
     }
 }
 
-fn judge(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
+fn judge(name: &str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
     for row in open_loop(&Alike { model, spec }, episodes, &mut rng::stream(0, "judge")) {
         let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
         println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
-        rows.push(Row { model: name, horizon, rmse, rmse_p90, coverage90 });
+        rows.push(Row { model: name.into(), horizon, rmse, rmse_p90, coverage90 });
     }
 }
 
@@ -142,53 +144,33 @@ fn study(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let mut writer = csv::Writer::from_path(folder.join(format!("{}.csv", task.name())))?;
     rows.iter().try_for_each(|row| writer.serialize(row))?;
     writer.flush()?;
-    draw(task, &rows, &folder.join(format!("{}.svg", task.name())))
+    draw(task, folder)
 }
 
-fn draw(task: Task, rows: &[Row], path: &Path) -> Result<(), Box<dyn Error>> {
-    let area = SVGBackend::new(path, (640, 400)).into_drawing_area();
-    area.fill(&WHITE)?;
+/// Draws a task's table.
+fn draw(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
+    let table = folder.join(format!("{}.csv", task.name()));
+    let rows = csv::Reader::from_path(table)?.into_deserialize().collect::<Result<Vec<Row>, _>>()?;
     let worst = rows.iter().map(|row| row.rmse).fold(1.1, f64::max).min(2.0);
-    let mut chart = ChartBuilder::on(&area)
-        .caption(format!("{}: how far learned models see", task.name()), ("sans-serif", 20))
-        .margin(14)
-        .x_label_area_size(44)
-        .y_label_area_size(54)
-        .build_cartesian_2d(0.0..25.5, 0.0..worst)?;
-    chart
-        .configure_mesh()
-        .light_line_style(WHITE)
-        .x_desc("steps ahead, eyes closed")
-        .y_desc("error (1: foreseeing no change)")
-        .label_style(("sans-serif", 14))
-        .draw()?;
-    chart.draw_series(DashedLineSeries::new(
-        [(0.0, 1.0), (25.0, 1.0)],
-        7,
-        5,
-        RGBColor(110, 110, 110).stroke_width(1),
-    ))?;
-    let colours = [RGBColor(0, 114, 178), RGBColor(230, 159, 0), RGBColor(204, 121, 167)];
-    for (model, colour) in ["ensemble", "autoencoder", "rssm"].into_iter().zip(colours) {
+    let mut chart = Chart::new("steps ahead", "open-loop prediction error (1: predicting no change)")
+        .x_between(0.0, 25.5)
+        .between(0.0, worst)
+        .mark(1.0)
+        .legend(SeriesLabelPosition::UpperRight);
+    for (model, colour) in ["ensemble", "autoencoder", "rssm"].into_iter().zip([0, 4, 3].map(|i| PALETTE[i])) {
         let line = rows.iter().filter(|row| row.model == model).map(|row| (row.horizon as f64, row.rmse));
-        chart
-            .draw_series(LineSeries::new(line, colour.stroke_width(3)))?
-            .label(model)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], colour.stroke_width(3)));
+        chart = chart.line(model, line).coloured(colour);
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperRight)
-        .background_style(WHITE.mix(0.85))
-        .border_style(RGBColor(180, 180, 180))
-        .label_font(("sans-serif", 14))
-        .draw()?;
-    area.present()?;
-    Ok(())
+    let panels = Panels::new(&format!("{}: open-loop prediction error of learned models", task.name())).panel(chart);
+    Ok(std::fs::write(folder.join(format!("{}.svg", task.name())), panels.svg()?)?)
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let named: Result<Vec<Task>, _> = std::env::args().skip(1).map(|name| name.parse()).collect();
+    let mut names: Vec<String> = std::env::args().skip(1).collect();
+    let only_draw = names.first().is_some_and(|name| name == "draw");
+    names.drain(..usize::from(only_draw));
+    let named: Result<Vec<Task>, _> = names.iter().map(|name| name.parse()).collect();
     let tasks = Some(named?).filter(|tasks| !tasks.is_empty()).unwrap_or_else(|| vec![Task::Reach, Task::Push]);
-    tasks.into_iter().try_for_each(|task| study(task, Path::new("data/foresight")))
+    let folder = Path::new("data/foresight");
+    tasks.into_iter().try_for_each(|task| if only_draw { draw(task, folder) } else { study(task, folder) })
 }

@@ -21,17 +21,17 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     tasks.dedup();
     let mut text = String::from("# Comparison\n\n");
     text += "Every number here comes from `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` beside this page. ";
-    text += "All methods are judged alike: the same tasks, observations and starts, deterministic actions, every ";
-    text += "environment step counted, the random warm-up too. ";
-    text += "Not alike is what they are told: `oracle` plans on the true simulator, `pets` in a learned model but with the ";
-    text += "known reward as a function of what is observed; `dreamer` and `sac` have only the rewards that they receive.\n\n";
+    text += "All methods are evaluated in the same way: the same tasks, observations and initial states, deterministic actions, ";
+    text += "and every environment step counted, including the random warm-up. ";
+    text += "They differ in what they are given: `oracle` plans on the true simulator, `pets` in a learned model but with the ";
+    text += "known reward function of the observations; `dreamer` and `sac` only receive rewards.\n\n";
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(
-        "\nSuccess: share of test episodes in which the task is fulfilled at the last step, with its 95 % Wilson \
-         interval. Steps to {:.0} %: median over the seeds of the environment steps after which the success curve first \
-         reaches that level, a straight line between two evaluations (a dash: it does not). SPARC, LDLJ: smoothness of \
-         the hand's movement; nearer to zero is smoother.\n",
+        "\nSuccess: share of test episodes in which the task is fulfilled at the last step (success rate), with its 95 % \
+         Wilson interval. Steps to {:.0} %: median over the seeds of the environment steps after which the success rate \
+         first reaches that level, linear between two evaluations (a dash: it does not). SPARC, LDLJ: smoothness of the \
+         hand's movement; nearer to zero is smoother.\n",
         100.0 * LEVEL
     );
     for task in &tasks {
@@ -39,24 +39,24 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         write!(text, "\n## {task}\n\n").expect("text grows");
         text += &findings(&tables, task)?;
         if figures::learning_curves(&tables, task, &to.join(&curves))? {
-            write!(text, "\n![Success of each method on {task} over environment steps]({curves})\n")
+            write!(text, "\n![Success rate of each method on {task} over environment steps]({curves})\n")
                 .expect("text grows");
         }
         figures::tests(&tables, task, &to.join(&tests))?;
-        write!(text, "\n![Success and smoothness of each method on {task} in the test]({tests})\n")
+        write!(text, "\n![Success rate and smoothness of each method on {task} in the test]({tests})\n")
             .expect("text grows");
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
             let file = format!("{task}-{method}-model.svg");
             if figures::model(&tables, task, method, &to.join(&file))? {
                 write!(
                     text,
-                    "\n![Error and calibration of the model of {method} on {task} over environment steps]({file})\n"
+                    "\n![Open-loop prediction error and calibration of the model of {method} on {task} over environment steps]({file})\n"
                 )
                 .expect("text grows");
             }
             let file = format!("{task}-{method}-values.svg");
             if figures::values(&tables, task, method, &to.join(&file))? {
-                write!(text, "\n![What {method} expects on {task} over environment steps, and what comes]({file})\n")
+                write!(text, "\n![Value that {method} estimates on {task} over environment steps, and the return that followed]({file})\n")
                     .expect("text grows");
             }
         }
@@ -110,7 +110,7 @@ fn text_table(rows: &[[String; 9]]) -> String {
     table.to_string()
 }
 
-/// What the numbers say, in words.
+/// The results of each method in a sentence.
 fn findings(tables: &Tables, task: &str) -> Result<String> {
     let mut text = String::new();
     for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
@@ -144,9 +144,9 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
         }
     }
     Ok(match fewest {
-        f64::INFINITY => "No method here learns, so there is nothing to be unsure of but the test itself.\n".into(),
+        f64::INFINITY => "No method here learns, so the only uncertainty is that of the test itself.\n".into(),
         n if n < 5.0 => format!(
-            "Not very: with {n:.0} seed{} of a learning method, the intervals tell how well these very agents do, not how \
+            "Not very: with {n:.0} seed{} of a learning method, the intervals say how well these trained agents do, not how \
              the method does. Run `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
             if n == 1.0 { "" } else { "s" }
         ),

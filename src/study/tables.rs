@@ -12,10 +12,10 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::rng;
 
-/// A success rate counts as reached at this level, in the column `steps_to_80`.
+/// The success rate that counts as reached in the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
 
-/// Environment steps, and the value at each: of one seed.
+/// Environment steps and the value at each, for one seed.
 pub type Curve = (Vec<f64>, Vec<f64>);
 
 /// The tables of a study.
@@ -23,9 +23,11 @@ pub type Curve = (Vec<f64>, Vec<f64>);
 pub struct Tables {
     /// task, method, seed, step, success, ...: every evaluation of every learning run.
     pub evaluations: DataFrame,
-    /// task, method, seed, step, horizon, rmse, ...: how well every learned model foresaw each evaluation.
+    /// task, method, seed, step, horizon, rmse, ...: the open-loop prediction error of every learned model in each
+    /// evaluation.
     pub models: DataFrame,
-    /// task, method, seed, step, expected, realised, ...: what every agent expected of each evaluation, and what came.
+    /// task, method, seed, step, expected, realised, ...: the value that every agent estimated in each evaluation, and the
+    /// discounted return that followed.
     pub values: DataFrame,
     /// task, method, seed, episode, return, success, ...: every test episode.
     pub tests: DataFrame,
@@ -117,7 +119,7 @@ impl Tables {
         Ok(rows("task")?.into_iter().zip(rows("method")?).collect())
     }
 
-    /// The success curves of a method: for each seed, steps and success rates.
+    /// The success curves of a method, one for each seed.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -125,8 +127,8 @@ impl Tables {
         curves(&self.evaluations, task, method, "success").map_err(inside)
     }
 
-    /// A number of `models.csv` over steps, for one horizon: for each seed, steps and values. Empty for methods without
-    /// a model.
+    /// A column of `models.csv` over environment steps, `horizon` steps ahead: one curve for each seed. Empty for methods
+    /// without a model.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -141,7 +143,8 @@ impl Tables {
         found().map_err(inside)
     }
 
-    /// A column of `values.csv` over steps: for each seed, steps and values. Empty for methods that expect nothing.
+    /// A column of `values.csv` over environment steps: one curve for each seed. Empty for methods that
+    /// estimate no value.
     ///
     /// # Errors
     /// If the table lacks the column.
@@ -149,7 +152,7 @@ impl Tables {
         curves(&self.values, task, method, column).map_err(inside)
     }
 
-    /// A number of the summary, if it has one there.
+    /// A number of the summary, if the task and method have one in this column.
     ///
     /// # Errors
     /// If the table lacks a column.
