@@ -1,5 +1,5 @@
-//! PETS at the sizes of the usual comparison: 5 members of 28-3x200-24 (SiLU), 350 candidates, 15 steps, 20 particles, 5
-//! iterations; and at the sizes of the presets. Products of the same sizes stand beside it: the bound.
+//! PETS at the sizes common in the literature (5 members of 28-3x200-24 with SiLU; 350 candidates, 15 time steps, 20
+//! particles, 5 CEM iterations) and at those of the presets. Matrix products of the same sizes give the upper bound.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use handful::rng::{self, Rng};
 
 use rayon::prelude::*;
 
-/// As in the program itself.
+/// The allocator of the binary `handful`.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -70,7 +70,7 @@ fn plans(c: &mut Criterion) {
         };
         let mut agent = pets(&spec(), Arc::new(Distance), config);
         let obs = vec![0.5; 24];
-        // 350 x 5 candidates, 15 steps, 20 particles, 95,200 products each: the network's share of an action.
+        // 350 x 5 candidates, 15 time steps, 20 particles, 95,200 multiply-adds each: the networks' part of an action.
         group.throughput(Throughput::Elements(2 * 350 * 5 * 15 * 20 * (28 * 200 + 2 * 200 * 200 + 200 * 48)));
         group.bench_function(
             BenchmarkId::new("one CEM action (throughput: FLOP of products)", format!("{propagation:?}")),
@@ -116,7 +116,7 @@ fn training(c: &mut Criterion) {
     group.finish();
 }
 
-/// What the machine can do at these sizes, on all cores: the bound on everything above.
+/// Matrix products at these sizes on all cores: the upper bound for everything above.
 fn products(c: &mut Criterion) {
     let mut group = c.benchmark_group("matrix product");
     for (rows, inner, columns) in [(100, 200, 200), (256, 256, 256)] {

@@ -1,5 +1,5 @@
-//! Every chapter becomes a program for the tests: the same file name and the same line numbers, so that an error of the compiler
-//! points to the chapter.
+//! Turns every chapter into a program for the tests, with the same file name and line numbers, so that compiler errors point to
+//! the chapter.
 
 use std::path::{Path, PathBuf};
 use std::{env, fs};

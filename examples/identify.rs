@@ -96,7 +96,7 @@ impl Push {
                 obs[i] = *change as f32;
             }
             obs[..CUBE].copy_from_slice(&seen[..CUBE]);
-            layout.complete(&mut obs);
+            layout.recompute_derived(&mut obs);
             poses.push(pose(&obs));
         }
         poses

@@ -1,15 +1,15 @@
-//! Files that are written whole or not at all.
+//! Writing files atomically: whole or not at all.
 
 use std::io::Write;
 use std::path::Path;
 
 use crate::error::{Error, Result};
 
-/// Writes a file under a temporary name beside it, then renames it: a crash, a full disk or Ctrl-C
-/// leaves either the old file or the new one.
+/// Writes a file atomically, and creates its folder if necessary. The bytes go to a temporary file in the same folder, which
+/// is then renamed, so that a crash, a full disk or Ctrl-C leaves either the old file or the new one.
 ///
 /// # Errors
-/// If the folder cannot be created or the file cannot be written.
+/// If the folder cannot be created, or the file cannot be written.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
@@ -19,7 +19,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     Ok(())
 }
 
-/// Temporary files are private by nature; ours are to be read by others once they have their name.
+/// Temporary files are readable by their owner only; ours must have ordinary permissions once they are renamed.
 fn temporary() -> tempfile::Builder<'static, 'static> {
     let mut builder = tempfile::Builder::new();
     #[cfg(unix)]

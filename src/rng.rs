@@ -1,31 +1,50 @@
-//! Random numbers: always from a generator that was passed in, never from a global one.
+//! Random numbers. Every function that needs them takes a generator as an argument; there is no global one.
+//!
+//! A run has one seed. Each purpose within it has a stream of its own, so that drawing more numbers for one purpose does not
+//! change any other:
+//!
+//! ```
+//! use handful::rng;
+//!
+//! let mut exploration = rng::stream(0, "exploration");
+//! let x = rng::normal(&mut exploration);
+//!
+//! // The same seed and purpose give the same numbers; another purpose gives others.
+//! assert_eq!(rng::normal(&mut rng::stream(0, "exploration")), x);
+//! assert_ne!(rng::normal(&mut rng::stream(0, "evaluation")), x);
+//!
+//! // The state of a generator can be saved, for instance in a checkpoint, and restored.
+//! let mut restored = rng::from_state(&rng::state(&exploration));
+//! assert_eq!(rng::normal(&mut restored), rng::normal(&mut exploration));
+//! ```
 
 use rand::{RngExt, SeedableRng};
 
-/// The generator used everywhere: fast, small, and its state can be saved.
+/// The generator used throughout: xoshiro256++, whose state is four words and can be saved.
+#[doc(alias = "seed")]
 pub type Rng = rand_xoshiro::Xoshiro256PlusPlus;
 
-/// The generator for `purpose` in a run with this `seed`. Different purposes give independent
-/// streams, so that drawing more numbers for one never changes another.
+/// The generator for `purpose` in a run with this `seed`. Different purposes give independent streams. Old checkpoints and
+/// published numbers depend on these strings.
 pub fn stream(seed: u64, purpose: &str) -> Rng {
-    // FNV-1a: a hash that will be the same in every version of this crate.
+    // FNV-1a, because the standard library's hash may change between versions.
     let hash = purpose
         .bytes()
         .fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
     Rng::seed_from_u64(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ hash)
 }
 
-/// A number drawn uniformly from `low..high`.
+/// A sample from the uniform distribution on `low..high`.
 pub fn uniform(rng: &mut Rng, low: f64, high: f64) -> f64 {
     low + (high - low) * rng.random::<f64>()
 }
 
-/// A number drawn from the standard normal distribution.
+/// A sample from the standard normal distribution.
 pub fn normal(rng: &mut Rng) -> f64 {
     rng.sample(rand_distr::StandardNormal)
 }
 
-/// A standard normal number, drawn again until it lies within two standard deviations.
+/// A sample from the standard normal distribution truncated to two standard deviations, by rejection.
 pub fn truncated_normal(rng: &mut Rng) -> f64 {
     loop {
         let z = normal(rng);
@@ -35,23 +54,23 @@ pub fn truncated_normal(rng: &mut Rng) -> f64 {
     }
 }
 
-/// A generator of its own, whose numbers follow from one drawn here.
+/// A new generator, seeded with a number drawn from this one.
 pub fn fork(rng: &mut Rng) -> Rng {
     Rng::seed_from_u64(rng.random())
 }
 
-/// The generator's state, to be saved.
+/// The state of a generator, for [`from_state`].
 pub fn state(rng: &Rng) -> [u64; 4] {
     let bytes = rng.state();
     std::array::from_fn(|i| u64::from_le_bytes(std::array::from_fn(|k| bytes[8 * i + k])))
 }
 
-/// A generator that continues from a saved state.
+/// A generator that continues from a state saved with [`state`].
 ///
 /// # Panics
-/// If the state is not four numbers.
+/// If `state` does not have length 4.
 pub fn from_state(state: &[u64]) -> Rng {
-    assert_eq!(state.len(), 4, "four words of state");
+    assert_eq!(state.len(), 4, "the state of a generator has four words");
     Rng::from_seed(std::array::from_fn(|i| state[i / 8].to_le_bytes()[i % 8]))
 }
 
@@ -59,7 +78,7 @@ pub fn from_state(state: &[u64]) -> Rng {
 mod tests {
     use super::*;
 
-    /// State in and out, and the words of xoshiro256++ as they stand in old checkpoints.
+    /// A saved state continues the same stream, and its words mean what they mean in old checkpoints.
     #[test]
     fn a_generator_continues_from_its_state() {
         let mut rng = stream(3, "state");

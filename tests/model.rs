@@ -101,7 +101,7 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
             assert!(said.epistemic[0] < said.aleatoric[0], "with so much data, chance is the greater part");
             let total = (said.aleatoric[0] + said.epistemic[0]).sqrt();
             let outcome = f64::from(step(&obs, action, &mut rng)[0]);
-            judged.push(GaussianForecast { mean: said.mean[0], deviation: total, outcome });
+            judged.push(GaussianForecast { mean: said.mean[0], std: total, outcome });
         }
         let inside = coverage(&judged, 0.9);
         assert!((0.84..0.97).contains(&inside), "{inside} of the outcomes lie in the interval of 90 %");
@@ -249,7 +249,7 @@ fn latent_models_foresee_too() {
         wrong += (told - truth).abs() / episode.actions.len() as f32;
     }
     assert!(wrong < 0.15, "rewards between -3 and 0 are told to {wrong}");
-    assert!((world.continues(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
+    assert!((world.continuations(&belief.features())[0] - config.discount()).abs() < 0.02, "episodes here never end");
 }
 
 /// The tape's gradients against central differences, for known and for learned rewards.
@@ -395,5 +395,35 @@ fn a_cube_may_lie_on_any_side() {
             latent.observe(&latent.initial(1), &still, &obs, &mut rng).features()
         });
         assert_eq!(values(&one), values(&other), "what is believed");
+    }
+}
+
+/// A goal does not move, so the dynamics need not see it; but a learned reward must.
+#[test]
+fn a_learned_reward_sees_the_goal() {
+    let features = [Feature::new("x"), Feature::new("goal").constant(), Feature::new("way").difference("goal", "x")];
+    let spec = Spec::new("line", features, 1, 50, 0.1);
+    let mut rng = rng::stream(0, "goals");
+    let mut data = ReplayBuffer::new(3, 1, 2000);
+    for _ in 0..2000 {
+        let [x, goal, action] = [0; 3].map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32);
+        let next = x + 0.1 * action;
+        data.push(&Transition {
+            obs: vec![x, goal, goal - x],
+            action: vec![action],
+            reward: -(goal - next).abs(),
+            next_obs: vec![next, goal, goal - next],
+            terminated: false,
+            truncated: false,
+        });
+    }
+    let mut ensemble =
+        Ensemble::new(&spec, EnsembleConfig { learn_reward: true, ..config() }, &mut rng).expect("usable settings");
+    ensemble.fit(&data, &mut rng);
+    let reward =
+        |x: f32, goal: f32| *ensemble.dynamics().predict(&[x, goal, goal - x], &[0.0]).mean.last().expect("a reward");
+    for (x, goal) in [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.8, 0.7)] {
+        let (predicted, truth) = (reward(x, goal), -f64::from((goal - x).abs()));
+        assert!((predicted - truth).abs() < 0.15, "at {x}, goal {goal}: {predicted}, not {truth}");
     }
 }

@@ -1,10 +1,14 @@
 //! Every planner finds known optima, and none needs to know what it plans for.
 
+use std::sync::Arc;
+
+use handful::model::EnsembleConfig;
 use handful::plan::{
-    ActionSequences, CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MppiConfig,
-    Objective, Plan, PlannerConfig, RecedingHorizon, ShootingConfig,
+    ActionSequences, CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MakePlanner,
+    MppiConfig, Objective, Plan, PlanObserver, Planner, PlannerConfig, RecedingHorizon, ShootingConfig,
 };
-use handful::rng;
+use handful::prelude::*;
+use handful::rng::{self, Rng};
 
 const HORIZON: usize = 8;
 
@@ -208,4 +212,96 @@ fn not_a_number_is_never_chosen() {
         assert!(plan.actions.iter().all(|a| a.is_finite()), "{name}");
         assert!(plan.actions[0] <= 0.0 && plan.best_return.is_finite(), "{name}: {:?}", &plan.actions[..2]);
     }
+}
+
+/// A planner of the test's own: always the same action, one of three, whichever has the highest return.
+struct BangBang {
+    horizon: usize,
+    action_size: usize,
+}
+
+impl Planner for BangBang {
+    fn reset(&mut self) {}
+
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, _rng: &mut Rng) -> Plan {
+        let mut candidates = ActionSequences::new(self.horizon, self.action_size);
+        let width = self.horizon * self.action_size;
+        for action in [-1.0, 0.0, 1.0] {
+            candidates.values.extend(vec![action; width]);
+        }
+        let returns = objective.returns(&candidates);
+        let winner = (0..3).max_by(|a, b| returns[*a].total_cmp(&returns[*b])).expect("three candidates");
+        let actions = candidates.row(winner).to_vec();
+        let mean: Vec<f64> = actions.iter().map(|a| f64::from(*a)).collect();
+        observer(&Iteration { index: 0, candidates: &candidates, returns: &returns, mean: &mean });
+        Plan { actions, best_return: returns[winner] }
+    }
+
+    fn shift(&mut self, _steps: usize) {}
+}
+
+fn bang_bang(action_size: usize) -> BangBang {
+    BangBang { horizon: 4, action_size }
+}
+
+#[test]
+fn a_planner_of_ones_own_enters_receding_horizon_control() {
+    let config = ControlConfig { action_repeat: 2, replan_every: 4 };
+    let mut control = RecedingHorizon::new(bang_bang.make(1), 1, &config);
+    let mut plans = 0;
+    for _ in 0..16 {
+        let mut left = |candidates: &ActionSequences| -> Vec<f32> {
+            plans += 1;
+            assert_eq!((candidates.count(), candidates.horizon), (3, 8));
+            candidates.rows().map(|row| -row.iter().sum::<f32>()).collect()
+        };
+        assert_eq!(control.act(&mut left, &mut |_| {}, &mut rng::stream(0, "own planner")), [-1.0]);
+    }
+    assert_eq!(plans, 2);
+}
+
+#[test]
+#[should_panic(expected = "`replan_every` is 5")]
+fn a_plan_that_is_too_short_is_told_so() {
+    let config = ControlConfig { replan_every: 5, ..ControlConfig::default() };
+    let mut control = RecedingHorizon::new(bang_bang.make(1), 1, &config);
+    let mut any = |candidates: &ActionSequences| vec![0.0; candidates.count()];
+    control.act(&mut any, &mut |_| {}, &mut rng::stream(0, "own planner"));
+}
+
+#[test]
+fn a_planner_of_ones_own_enters_pets_and_the_oracle() {
+    let extremes = |action: &[f32]| [-1.0, 0.0, 1.0].contains(&action[0]);
+    let mut env = Task::Pendulum.make();
+
+    let oracle = Oracle::new(|| Ok(Task::Pendulum.make()), OracleConfig::default(), 0).expect("usable settings");
+    let mut oracle = oracle.with_planner(bang_bang);
+    env.reset(0);
+    assert!(extremes(&oracle.plan(0, &env.snapshot())));
+
+    let ensemble =
+        EnsembleConfig { members: 2, elites: 2, hidden: vec![16], first_steps: 50, ..EnsembleConfig::default() };
+    let config = PetsConfig { ensemble, particles: 2, warm_up: 40, ..PetsConfig::default() };
+    let reward = Arc::new(Task::Pendulum.make());
+    let pets = Pets::new(env.spec(), Some(reward), config, 0).expect("usable settings");
+    let mut pets = pets.with_planner(bang_bang);
+    let mut obs = env.reset(0);
+    let mut in_between = 0;
+    for step in 0..60 {
+        let action = pets.act(&obs, Mode::Explore);
+        in_between += usize::from(!extremes(&action));
+        assert!(extremes(&action) || step < 40, "random first, planned then: {action:?}");
+        let Step { observation, reward, .. } = env.step(&action).expect("a step");
+        let (terminated, truncated) = (false, false);
+        pets.observe(&Transition { obs, action, reward, next_obs: observation.clone(), terminated, truncated });
+        pets.update();
+        obs = observation;
+    }
+    assert!(in_between > 0);
+    let slots = [Slot::single(true, &obs, &env)];
+    assert!(extremes(&pets.act_batch(&slots)[0]), "in evaluations, too");
+    // Training goes on with the same planner.
+    let state = pets.training_state();
+    pets.load_training_state(&state).expect("its own state");
+    assert!(extremes(&pets.act(&obs, Mode::Explore)));
 }

@@ -1,5 +1,5 @@
-//! A chapter, as people write it: Markdown in which every fence ` ```rust ` is a cell. Cells share their state, as in a notebook.
-//! A fence with anything behind the word (` ```rust,ignore `) is only shown.
+//! The source of a chapter: Markdown in which every fence ` ```rust ` is a cell. Cells share their state, as in a notebook.
+//! A fence with anything after `rust` (` ```rust,ignore `) is shown but not run.
 
 use std::io::{self, Error, ErrorKind};
 use std::path::Path;
@@ -14,7 +14,7 @@ pub struct Chapter {
     lines: usize,
 }
 
-/// A stretch of a chapter.
+/// A part of a chapter.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Part {
     /// Markdown.
@@ -23,9 +23,9 @@ pub enum Part {
     Cell {
         /// The code, without its fence.
         code: String,
-        /// The line on which the code begins, from 1.
+        /// The line on which the code begins, counted from 1.
         line: usize,
-        /// Whether it is the solution of an exercise, and folded.
+        /// Whether it is folded away, as the solutions of exercises are.
         folded: bool,
     },
 }
@@ -48,7 +48,7 @@ impl Chapter {
         Ok(chapters)
     }
 
-    /// Takes a chapter apart.
+    /// Splits a chapter into its parts.
     ///
     /// # Errors
     /// If a fence is not closed.
@@ -88,8 +88,8 @@ impl Chapter {
         Ok(Self { name: name.into(), parts, lines: text.lines().count() })
     }
 
-    /// One program of all cells, each on its own lines. A cell's last expression shows itself in a notebook; here it becomes a
-    /// statement.
+    /// All cells as one program, each on its original lines. A cell may end in an expression, whose value a notebook shows; here
+    /// it becomes a statement.
     pub fn program(&self) -> String {
         let mut lines = vec![String::new(); self.lines.max(1) + 1];
         lines[0] = "pub fn run() -> std::result::Result<(), Box<dyn std::error::Error>> {".into();
@@ -98,7 +98,7 @@ impl Chapter {
             for (i, code) in code.lines().enumerate() {
                 lines[line - 1 + i] = code.into();
             }
-            // On the line of the closing fence, where no comment can swallow it.
+            // On the line of the closing fence, so that a comment at the cell's end cannot swallow it.
             lines[line - 1 + code.lines().count()] = ";".into();
         }
         lines[self.lines.max(1)] = "Ok(()) }".into();

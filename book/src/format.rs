@@ -1,17 +1,17 @@
-//! Cells are formatted by rustfmt, each by itself, in lines that a page can show.
+//! Formats each cell with rustfmt, in lines short enough for a page.
 
 use std::io::{self, Write};
 use std::process::{Command, Stdio};
 
 use crate::chapter::{Chapter, Part};
 
-/// Columns of a cell.
+/// Maximal width of a line in a cell.
 const WIDTH: usize = 80;
 
-/// A cell as rustfmt would have it.
+/// A cell as rustfmt formats it.
 ///
 /// # Errors
-/// If rustfmt cannot be started, or cannot read the cell.
+/// If rustfmt cannot be started, or cannot parse the cell.
 pub fn formatted(code: &str) -> io::Result<String> {
     let config = format!("max_width={},use_small_heuristics=Max", WIDTH + 4);
     let mut rustfmt = Command::new("rustfmt")
@@ -32,7 +32,7 @@ pub fn formatted(code: &str) -> io::Result<String> {
     Ok(inside.iter().map(|line| format!("{}\n", line.strip_prefix("    ").unwrap_or(line))).collect())
 }
 
-/// The lines at which cells of a chapter begin that are not formatted.
+/// The first lines of the cells of a chapter that are not formatted.
 ///
 /// # Errors
 /// As [`formatted`].

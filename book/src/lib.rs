@@ -1,11 +1,10 @@
-//! One source, three readings. People write `chapters/*.md`; from it come the page (mdBook), the notebook (Jupyter) and the test
-//! (`cargo test`).
+//! One source, three outputs: from `chapters/*.md` come the pages (mdBook), the notebooks (Jupyter) and the tests (`cargo test`).
 //!
-//! | reading | made by | kept |
+//! | output | made by | stored in |
 //! | --- | --- | --- |
-//! | test | `build.rs`, when `cargo test` builds | nowhere: it is made anew |
-//! | notebook | `cargo book notebooks`, which has Jupyter execute it | `notebooks/`, with what its cells answered |
-//! | page | `cargo book build`, from the chapter and those answers | `target/book` |
+//! | test | `build.rs`, when `cargo test` builds | nothing: it is generated again |
+//! | notebook | `cargo book notebooks`, which makes Jupyter execute it | `notebooks/`, with the outputs of its cells |
+//! | page | `cargo book build`, from the chapter and those outputs | `target/book` |
 
 pub mod chapter;
 pub mod format;

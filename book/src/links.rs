@@ -1,10 +1,10 @@
-//! Links and pictures that lead nowhere.
+//! Broken links and missing pictures.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Every broken reference of the pages in a folder: to a file that is not there, or a place that a page does not have.
+/// Every broken reference in the pages of a folder: to a file that does not exist, or to an anchor that its page lacks.
 pub fn broken(folder: &Path) -> std::io::Result<Vec<String>> {
     let mut pages = BTreeMap::new();
     for entry in fs::read_dir(folder)? {
@@ -34,7 +34,7 @@ pub fn broken(folder: &Path) -> std::io::Result<Vec<String>> {
     Ok(broken)
 }
 
-/// The values of an attribute, as mdBook writes it.
+/// All values of an attribute, in the form in which mdBook writes it.
 fn attributes<'a>(page: &'a str, name: &str) -> impl Iterator<Item = &'a str> {
     let opening = format!(" {name}=\"");
     let mut rest = page;

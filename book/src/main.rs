@@ -16,25 +16,25 @@ use mdbook_preprocessor::book::{Book, BookItem};
 use mdbook_preprocessor::{Preprocessor, PreprocessorContext};
 use serde_json::Value;
 
-/// One source, three readings: the chapters as pages, notebooks and tests.
+/// One source, three outputs: the chapters as pages, notebooks and tests.
 #[derive(Parser)]
 enum Press {
-    /// Makes the pages: target/book/index.html
+    /// Build the pages: target/book/index.html
     Build,
-    /// Makes the pages, shows them, and makes them anew when a chapter changes
+    /// Build and serve the pages, and rebuild them when a chapter changes
     Serve {
-        /// Where to listen
+        /// Address to listen on
         #[arg(long, default_value = "127.0.0.1:3000")]
         address: String,
     },
-    /// Makes notebooks and has Jupyter execute them; those that are up to date are left alone
+    /// Generate the notebooks that are out of date and execute them with Jupyter
     Notebooks {
-        /// Only these, up to date or not: 01-hand
+        /// Only these (such as 01-hand), even if they are up to date
         names: Vec<String>,
     },
-    /// Says which notebooks do not belong to their chapters any more
+    /// List the notebooks that are out of date
     Check,
-    /// Formats the cells of all chapters
+    /// Format the cells of all chapters
     Format,
 }
 
@@ -51,10 +51,10 @@ fn main() -> Result<()> {
 
 // Pages.
 
-/// What formulas are set in, beside the book's settings and beside its pages.
+/// The font of the formulas, relative to `book/` and to the pages.
 const FONT: &str = "fonts/stix-two-math.woff2";
 
-/// Splices answers, formulas and pictures into the chapters.
+/// Replaces each chapter by its page, with outputs, formulas and pictures.
 struct Splice {
     pages: BTreeMap<String, String>,
 }
@@ -94,7 +94,7 @@ fn build(root: &Path) -> Result<()> {
     for picture in pictures {
         let to = out.join(&picture);
         fs::create_dir_all(to.parent().context("a folder")?)?;
-        fs::copy(root.join(&picture), &to).with_context(|| format!("{}: a chapter shows it", picture.display()))?;
+        fs::copy(root.join(&picture), &to).with_context(|| format!("{}: needed by a chapter", picture.display()))?;
     }
     fs::copy(root.join("book").join(FONT), out.join(FONT)).context(FONT)?;
     let broken = links::broken(&out)?;
@@ -138,14 +138,14 @@ fn serve(root: &Path, address: &str) -> Result<()> {
                     let _ = request.respond(tiny_http::Response::from_data(bytes).with_header(header));
                 }
                 _ => {
-                    let _ = request.respond(tiny_http::Response::from_string("not here").with_status_code(404));
+                    let _ = request.respond(tiny_http::Response::from_string("not found").with_status_code(404));
                 }
             }
         }
     }
 }
 
-/// When a chapter, a notebook or the style was last written.
+/// When a chapter, a notebook or a file of `book/` was last written.
 fn newest(root: &Path) -> Result<SystemTime> {
     let mut newest = SystemTime::UNIX_EPOCH;
     for folder in ["chapters", "notebooks", "book"] {
@@ -176,7 +176,7 @@ fn check(root: &Path) -> Result<()> {
     let complaints: Vec<String> =
         chapters.iter().filter_map(|chapter| notebook::complaint(chapter, &root.join("notebooks"))).collect();
     if complaints.is_empty() {
-        println!("{} notebooks belong to their chapters", chapters.len());
+        println!("all {} notebooks are up to date", chapters.len());
         return Ok(());
     }
     bail!("{}", complaints.join("\n"))
@@ -189,10 +189,10 @@ fn notebooks(root: &Path, names: &[String]) -> Result<()> {
         let known: Vec<&str> = chapters.iter().map(|chapter| chapter.name.as_str()).collect();
         bail!("there is no chapter `{unknown}`; there are {}", known.join(", "));
     }
-    // Two at once would write the same files. Where files cannot be locked, nothing is known of another.
+    // Two processes would write the same files. Where the file system has no locks, they cannot be detected.
     let lock = fs::File::open(folder.join("setup")).context("notebooks/setup")?;
     if matches!(lock.try_lock(), Err(fs::TryLockError::WouldBlock)) {
-        bail!("another `cargo book notebooks` is at work: wait for it, or end it");
+        bail!("another `cargo book notebooks` is running: wait for it, or stop it");
     }
     for chapter in chapters {
         let wanted = if names.is_empty() {
@@ -213,11 +213,11 @@ fn notebooks(root: &Path, names: &[String]) -> Result<()> {
     Ok(())
 }
 
-/// Has Jupyter execute a notebook, and keeps it if all went well.
+/// Executes a notebook with Jupyter, and keeps it if no cell failed.
 fn execute(folder: &Path, chapter: &Chapter) -> Result<()> {
     let generated = notebook::generate(chapter);
     let mut running = generated.clone();
-    // A panic must not pass for an answer.
+    // By default the kernel reports a panic as success.
     let setup = format!("{}:preserve_vars_on_panic 0\n", notebook::SETUP);
     running["cells"][0]["source"] = Value::from(setup);
     let path = folder.join(format!(".{}.running.ipynb", chapter.name));
@@ -250,7 +250,7 @@ fn execute(folder: &Path, chapter: &Chapter) -> Result<()> {
     Ok(())
 }
 
-/// How long the cells took, the first one apart: it builds what all others use.
+/// How long the cells took, without the first, which builds the library.
 fn times(executed: &Value) -> String {
     let cells = executed["cells"].as_array().into_iter().flatten().filter(|cell| cell["cell_type"] == "code");
     let mut seconds: Vec<f64> = cells
@@ -261,7 +261,7 @@ fn times(executed: &Value) -> String {
         })
         .collect();
     if seconds.len() < 2 {
-        return "no times".into();
+        return "no times recorded".into();
     }
     let first = seconds.remove(0);
     let total: f64 = seconds.iter().sum();

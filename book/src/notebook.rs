@@ -1,4 +1,4 @@
-//! Chapters as Jupyter notebooks: what is generated, what the kernel has answered, and whether the two still belong together.
+//! Chapters as Jupyter notebooks: generating them, reading the outputs of an execution, and detecting stale ones.
 
 use std::path::Path;
 use std::{fs, io};
@@ -7,19 +7,19 @@ use serde_json::{Value, json};
 
 use crate::chapter::{Chapter, Part};
 
-/// The first cell of every notebook: the only dependency, without the crates that only a study needs.
+/// The first cell of every notebook: its dependencies, without the crates that only a study needs.
 pub const SETUP: &str = ":cache 4000\n:dep handful = { path = \"..\", default-features = false, features = [\"figures\"] }\n:dep nalgebra = \"0.35\"\n";
 
-/// What a cell has answered.
+/// The output of a cell.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Answer {
     /// What it printed.
     pub text: String,
-    /// Figures and pages that it showed: HTML or SVG.
+    /// The figures that it showed, as HTML or SVG.
     pub shown: Vec<String>,
 }
 
-/// The notebook of a chapter, as yet without answers.
+/// The notebook of a chapter, without outputs.
 pub fn generate(chapter: &Chapter) -> Value {
     let mut cells = vec![code_cell("setup", SETUP, false)];
     for (i, part) in chapter.parts.iter().enumerate() {
@@ -50,7 +50,7 @@ fn code_cell(id: &str, code: &str, folded: bool) -> Value {
     })
 }
 
-/// Jupyter cannot fold a part of a text that reaches into the next cell: it folds the cell of code itself.
+/// In Jupyter, `<details>` cannot extend over several cells, so it is removed here; the code cell itself is folded instead.
 fn unfolded(text: &str) -> String {
     let kept = text.lines().filter(|line| *line != "</details>").map(|line| {
         match line.strip_prefix("<details>").and_then(|line| line.trim().strip_prefix("<summary>")) {
@@ -73,7 +73,7 @@ fn joined(value: &Value) -> String {
     }
 }
 
-/// Takes over answers (and nothing else) from an executed notebook of the same cells.
+/// Copies the outputs (and nothing else) from an executed notebook with the same cells.
 pub fn with_answers(mut generated: Value, executed: &Value) -> Value {
     let is_code = |cell: &&Value| cell["cell_type"] == "code";
     let executed = executed["cells"].as_array().into_iter().flatten().filter(is_code);
@@ -86,7 +86,7 @@ pub fn with_answers(mut generated: Value, executed: &Value) -> Value {
     generated
 }
 
-/// The notebook of a chapter of which only the text has changed since its cells were executed.
+/// The notebook of a chapter with its old outputs, if only the text has changed since its cells were executed.
 pub fn with_new_text(chapter: &Chapter, folder: &Path) -> Option<Value> {
     let code = |notebook: &Value| -> Vec<String> {
         let cells = notebook["cells"].as_array().into_iter().flatten();
@@ -99,12 +99,12 @@ pub fn with_new_text(chapter: &Chapter, folder: &Path) -> Option<Value> {
     (executed && code(&old) == code(&new)).then(|| with_answers(new, &old))
 }
 
-/// A cell that ends in a loop is worth `()`, which no reader needs to see.
+/// A cell that ends in a loop has the value `()`, which is not worth showing.
 fn says_nothing(output: &Value) -> bool {
     joined(&output["data"]["text/plain"]).trim() == "()"
 }
 
-/// The answer without what differs from run to run: what a compiler has to say while it builds.
+/// The output without what differs from run to run, such as timestamps in its metadata.
 fn without_noise(output: &Value) -> Value {
     let mut output = output.clone();
     if let Some(fields) = output.as_object_mut() {
@@ -116,7 +116,7 @@ fn without_noise(output: &Value) -> Value {
     output
 }
 
-/// Why a notebook does not belong to its chapter, if it does not.
+/// Why a notebook is out of date, if it is.
 pub fn complaint(chapter: &Chapter, folder: &Path) -> Option<String> {
     let mend = format!("run `cargo book notebooks {}`", chapter.name);
     let path = folder.join(format!("{}.ipynb", chapter.name));
@@ -135,31 +135,33 @@ pub fn complaint(chapter: &Chapter, folder: &Path) -> Option<String> {
     (silent > 0).then(|| format!("notebooks/{}.ipynb has {silent} cells that were not executed: {mend}", chapter.name))
 }
 
-/// What went wrong in an executed notebook, if anything did. The kernel calls a panic and an error that leaves a cell through `?`
-/// "ok" unless told otherwise; so what it wrote is read as well.
+/// The first failure in an executed notebook, if there is one. The kernel may report a panic, or an error that leaves a cell
+/// through `?`, as "ok", so this reads what the cells wrote to stderr as well.
 pub fn failure(executed: &Value) -> Option<String> {
     for (i, cell) in executed["cells"].as_array().into_iter().flatten().enumerate() {
         for output in cell["outputs"].as_array().into_iter().flatten() {
             let text = joined(&output["text"]);
-            // A kernel that cannot draw a chart writes it down instead: where a cell moves a variable of the notebook, it may.
+            // Instead of drawing a chart, the kernel prints its `Debug` form if the cell moved a variable into it.
             let undrawn = joined(&output["data"]["text/plain"]).starts_with("Chart {");
             let wrong = undrawn
                 || output["output_type"] == "error"
                 || output["name"] == "stderr" && (text.contains("panicked at") || text.contains("terminated with"));
             if wrong {
                 let said = match text.is_empty() {
-                    _ if undrawn => "the chart in words; give it clones of what it takes".into(),
+                    _ if undrawn => {
+                        "the chart as text instead of a picture: pass clones of the notebook's variables to it".into()
+                    }
                     true => joined(&output["traceback"]),
                     false => text,
                 };
-                return Some(format!("cell {i}:\n{}\nanswered\n{said}", joined(&cell["source"])));
+                return Some(format!("cell {i}:\n{}\nfailed:\n{said}", joined(&cell["source"])));
             }
         }
     }
     None
 }
 
-/// What the cells of a chapter have answered, in their order.
+/// The outputs of a chapter's cells, in order.
 pub fn answers(notebook: &Value) -> Vec<Answer> {
     let cells = notebook["cells"].as_array().into_iter().flatten();
     cells.filter(|cell| cell["cell_type"] == "code").skip(1).map(answer).collect()
@@ -188,12 +190,12 @@ fn answer(cell: &Value) -> Answer {
 /// Reads a notebook.
 ///
 /// # Errors
-/// If there is none, or it is not JSON.
+/// If the file cannot be read, or is not JSON.
 pub fn read(path: &Path) -> io::Result<Value> {
     Ok(serde_json::from_str(&fs::read_to_string(path)?)?)
 }
 
-/// Writes a notebook as Jupyter does: indented by one, with a line's end at its end.
+/// Writes a notebook as Jupyter does: indented by one space, with a final newline.
 ///
 /// # Errors
 /// If it cannot be written.

@@ -1,4 +1,4 @@
-//! Chapters as pages: after each cell what it has answered, formulas as MathML, pictures where the page finds them.
+//! Chapters as pages: the output of each cell below it, formulas as MathML, and pictures with paths relative to the page.
 
 use std::path::PathBuf;
 
@@ -8,7 +8,7 @@ use pulldown_latex::{Parser, RenderConfig, Storage, push_mathml};
 use crate::chapter::{Chapter, Part};
 use crate::notebook::Answer;
 
-/// A page and the files that it shows, relative to the repository.
+/// A page and the picture files that it needs, relative to the repository.
 pub struct Page {
     /// Markdown for mdBook.
     pub content: String,
@@ -17,10 +17,10 @@ pub struct Page {
 }
 
 impl Page {
-    /// The page of a chapter whose cells have given these answers.
+    /// The page of a chapter whose cells have these outputs.
     ///
     /// # Errors
-    /// If a formula cannot be read.
+    /// If a formula cannot be parsed.
     pub fn new(chapter: &Chapter, answers: &[Answer]) -> anyhow::Result<Self> {
         let mut page = Self { content: String::new(), pictures: Vec::new() };
         let mut answers = answers.iter();
@@ -42,7 +42,7 @@ impl Page {
         Ok(page)
     }
 
-    /// A page lies elsewhere than its chapter: `../data/...` becomes `data/...`.
+    /// Pages are in another folder than chapters: `../data/...` becomes `data/...`.
     fn with_pictures(&mut self, text: &str) -> String {
         for piece in text.split("](../data/").skip(1) {
             let name = piece.split(')').next().unwrap_or_default();
@@ -66,13 +66,13 @@ fn shown(answer: &Answer) -> String {
     html
 }
 
-/// Puts MathML for what stands between dollars, outside code.
+/// Replaces what stands between dollar signs, outside code, by MathML.
 fn formulas(text: &str) -> anyhow::Result<String> {
     let mut out = String::new();
     let mut rest = text;
     let mut line_start = true;
     while let Some(next) = rest.chars().next() {
-        // Code is left alone: a block up to its closing fence, a span up to as many backticks.
+        // Code is copied: a block up to its closing fence, a span up to the same number of backticks.
         if next == '`' {
             let ticks = rest.len() - rest.trim_start_matches('`').len();
             let fence = &rest[..ticks];
@@ -110,10 +110,10 @@ fn mathml(latex: &str, display_mode: DisplayMode) -> anyhow::Result<String> {
     let storage = Storage::new();
     let config = RenderConfig { display_mode, ..RenderConfig::default() };
     let events = Parser::new(latex, &storage).collect::<Result<Vec<_>, _>>();
-    let events = events.map_err(|error| anyhow::anyhow!("the formula `{latex}`: {error}"))?;
+    let events = events.map_err(|error| anyhow::anyhow!("formula `{latex}`: {error}"))?;
     let mut html = String::new();
     push_mathml(&mut html, events.into_iter().map(Ok::<_, std::convert::Infallible>), config)?;
-    // What means something to Markdown must not: two tildes would strike out what stands between.
+    // Escapes what has a meaning in Markdown: two tildes, for example, would strike out the text between them.
     let escapes = [("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")];
     Ok(escapes.into_iter().fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
 }

@@ -1,8 +1,9 @@
-//! What keeps the three readings of a chapter together: fresh notebooks, formatted cells, and checks that can fail.
+//! Keeps the three outputs of a chapter consistent: notebooks up to date, cells formatted, formulas readable; and checks the checks.
 
 use std::path::{Path, PathBuf};
 
 use handful_book::chapter::{Chapter, Part};
+use handful_book::page::Page;
 use handful_book::{format, notebook};
 use serde_json::json;
 
@@ -26,6 +27,15 @@ fn every_cell_is_formatted() {
     for chapter in chapters() {
         let lines = format::unformatted(&chapter).expect("rustfmt");
         assert!(lines.is_empty(), "chapters/{}.md, cells at lines {lines:?}: run `cargo book format`", chapter.name);
+    }
+}
+
+#[test]
+fn every_formula_can_be_read() {
+    for chapter in chapters() {
+        if let Err(error) = Page::new(&chapter, &[]) {
+            panic!("chapters/{}.md: {error}", chapter.name);
+        }
     }
 }
 
@@ -90,6 +100,6 @@ fn stale_and_failed_notebooks_are_found() {
     assert!(notebook::failure(&executed).expect("a panic").contains("assert!(1 + 1 == 2);"));
     executed["cells"][2]["outputs"] =
         json!([{ "output_type": "execute_result", "data": { "text/plain": "Chart { x" } }]);
-    assert!(notebook::failure(&executed).expect("not drawn").contains("the chart in words"));
+    assert!(notebook::failure(&executed).expect("not drawn").contains("the chart as text"));
     std::fs::remove_dir_all(&folder).expect("removed");
 }

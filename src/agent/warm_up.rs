@@ -1,26 +1,26 @@
-//! Random actions for as long as there is nothing better to go by.
+//! Random actions for the warm-up, and correlated exploration noise.
 
 use crate::plan::noise::ColoredNoise;
 use crate::rng::Rng;
 
-/// Coloured noise, an episode's worth at a time: actions by itself, or what moves a policy's actions about their mean.
+/// Coloured noise, drawn for a whole episode at a time: random actions, or the noise around a policy's actions.
+#[derive(Debug)]
 pub(super) struct RandomActions {
     noise: ColoredNoise,
-    /// Numbers in an action.
-    size: usize,
-    /// What is left of the episode's.
-    ahead: Vec<f32>,
+    action_size: usize,
+    /// What is left of the episode's noise, `[steps left, actions]`.
+    queue: Vec<f32>,
 }
 
 impl RandomActions {
-    /// For episodes of so many steps.
-    pub(super) fn new(noise_beta: f64, horizon: usize, size: usize) -> Self {
-        Self { noise: ColoredNoise::new(noise_beta, horizon.max(2)), size, ahead: Vec::new() }
+    /// Noise of exponent `noise_beta` for episodes of `horizon` time steps.
+    pub(super) fn new(noise_beta: f64, horizon: usize, action_size: usize) -> Self {
+        Self { noise: ColoredNoise::new(noise_beta, horizon.max(2)), action_size, queue: Vec::new() }
     }
 
     /// A new episode begins.
     pub(super) fn reset(&mut self) {
-        self.ahead.clear();
+        self.queue.clear();
     }
 
     /// The next action, each number in [-1, 1].
@@ -28,11 +28,11 @@ impl RandomActions {
         self.deviates(rng).into_iter().map(|a| a.clamp(-1.0, 1.0)).collect()
     }
 
-    /// The same, not clamped: each number by itself is standard normal.
+    /// The next time step of the noise, not clamped: each number has a standard deviation of about 1.
     pub(super) fn deviates(&mut self, rng: &mut Rng) -> Vec<f32> {
-        if self.ahead.is_empty() {
-            self.ahead = self.noise.sample_actions(self.size, rng).iter().map(|a| *a as f32).collect();
+        if self.queue.is_empty() {
+            self.queue = self.noise.sample_actions(self.action_size, rng).iter().map(|a| *a as f32).collect();
         }
-        self.ahead.drain(..self.size).collect()
+        self.queue.drain(..self.action_size).collect()
     }
 }

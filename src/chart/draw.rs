@@ -24,7 +24,7 @@ pub fn failed(error: Box<dyn std::error::Error>) -> Error {
     Error::BadSetting(format!("chart: {error}"))
 }
 
-/// In a notebook, what is printed so is shown as a picture.
+/// Prints an SVG as the evcxr kernel expects an image.
 pub fn display(svg: Result<String>) {
     match svg {
         Ok(svg) => println!("EVCXR_BEGIN_CONTENT image/svg+xml\n{svg}\nEVCXR_END_CONTENT"),
@@ -104,7 +104,7 @@ impl Chart {
                 Shape::Band => chart.draw_series([Polygon::new(points, colour.mix(0.2))])?,
             };
             if !name.is_empty() {
-                // In the legend, a small piece of it.
+                // A short piece of the line, or one point, for the legend.
                 let series = series.label(name);
                 match shape {
                     Shape::Dashed => {
@@ -130,7 +130,7 @@ impl Chart {
         Ok(())
     }
 
-    /// Where a legend hides the fewest points.
+    /// The corner in which the legend hides the fewest points.
     fn emptiest_corner(&self) -> SeriesLabelPosition {
         let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
         let along = |value: f64, log: bool| if log { value.ln() } else { value };
@@ -169,7 +169,7 @@ pub fn usable(range: Option<[f64; 2]>, log: bool) -> Option<(f64, f64)> {
     fits.then_some((low, high))
 }
 
-/// From the least to the largest number, and a little beyond.
+/// The range of the numbers with a small margin, or `None` if there are none.
 pub fn span(numbers: impl Iterator<Item = f64>, log: bool) -> Option<(f64, f64)> {
     let (low, high) =
         numbers.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (f64::min(low, x), f64::max(high, x)));
@@ -183,7 +183,7 @@ pub fn span(numbers: impl Iterator<Item = f64>, log: bool) -> Option<(f64, f64)>
     Some((low - margin, high + margin))
 }
 
-/// A number without noughts that say nothing.
+/// A number with up to four decimals, without trailing zeros.
 pub fn plain(x: f64) -> String {
     let text = format!("{x:.4}");
     let text = text.trim_end_matches('0').trim_end_matches('.');

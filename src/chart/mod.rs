@@ -1,6 +1,6 @@
 //! Charts as SVG: lines, points and bands in one frame ([`Chart`]), or frames side by side ([`Panels`]).
 //!
-//! In a notebook, either one shows itself at the end of a cell. What is not finite is left out of a chart.
+//! In a notebook, either one is displayed if it is the last expression of a cell. Numbers that are not finite are left out.
 //!
 //! ```
 //! use handful::chart::{Chart, Panels};
@@ -25,7 +25,7 @@ use crate::error::{Error, Result};
 use draw::{Layout, span, usable};
 pub use panels::Panels;
 
-/// Colours that stay apart for colour-blind readers (Okabe and Ito).
+/// Colours that colour-blind readers can tell apart (Okabe and Ito).
 pub const PALETTE: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -37,10 +37,10 @@ pub const PALETTE: [RGBColor; 7] = [
 ];
 /// The font of all figures.
 pub const FONT: &str = "sans-serif";
-/// Axes and their labels.
+/// The colour of axes and other secondary lines.
 pub const GREY: RGBColor = RGBColor(110, 110, 110);
 
-/// A chart, to be filled with [`Chart::line`] and its like.
+/// A chart. [`Chart::line`], [`Chart::dashed`], [`Chart::points`] and [`Chart::band`] add series to it.
 #[derive(Clone, Debug, Default)]
 pub struct Chart {
     x_label: String,
@@ -87,18 +87,18 @@ enum Shape {
 }
 
 impl Chart {
-    /// An empty chart with these names (and units) at its axes.
+    /// An empty chart with labels (quantity and unit) for its axes.
     pub fn new(x_label: &str, y_label: &str) -> Self {
         Self { x_label: x_label.into(), y_label: y_label.into(), ..Self::default() }
     }
 
-    /// Shows x on a logarithmic scale.
+    /// Uses a logarithmic scale for x. Points with x ≤ 0 are left out.
     pub fn log_x(mut self) -> Self {
         self.x_log = true;
         self
     }
 
-    /// Shows y on a logarithmic scale.
+    /// Uses a logarithmic scale for y. Points with y ≤ 0 are left out.
     pub fn log_y(mut self) -> Self {
         self.y_log = true;
         self
@@ -110,58 +110,59 @@ impl Chart {
         self
     }
 
-    /// Shows y between these; without it, or if they cannot be the ends of an axis, all points.
+    /// Sets the range of the y axis, which otherwise (or if an axis cannot have this range) follows from the points.
     pub fn between(mut self, low: f64, high: f64) -> Self {
         self.y_range = Some([low, high]);
         self
     }
 
-    /// Shows x between these; without it, or if they cannot be the ends of an axis, all points.
+    /// Sets the range of the x axis, which otherwise (or if an axis cannot have this range) follows from the points.
     pub fn x_between(mut self, low: f64, high: f64) -> Self {
         self.x_range = Some([low, high]);
         self
     }
 
-    /// About how many labels the x axis has (otherwise 11), and how a number is written there.
+    /// Sets the approximate number of labels on the x axis (otherwise 11) and how a number is written there.
     pub fn x_ticks(mut self, count: usize, text: fn(f64) -> String) -> Self {
         self.x_ticks = Ticks { count, text };
         self
     }
 
-    /// About how many labels the y axis has (otherwise 11), and how a number is written there.
+    /// Sets the approximate number of labels on the y axis (otherwise 11) and how a number is written there.
     pub fn y_ticks(mut self, count: usize, text: fn(f64) -> String) -> Self {
         self.y_ticks = Ticks { count, text };
         self
     }
 
-    /// Draws a thin dashed line at this y from end to end: a value to compare with.
+    /// Adds a thin dashed line at this y across the frame: a reference value.
     pub fn mark(mut self, y: f64) -> Self {
         self.mark = Some(y);
         self
     }
 
-    /// Puts the legend here, even for one name. Otherwise two or more names have one where it hides the fewest points.
+    /// Places the legend, even for a single name. Otherwise two or more names get one in the corner where it hides the
+    /// fewest points.
     pub fn legend(mut self, position: SeriesLabelPosition) -> Self {
         self.legend = Some(position);
         self
     }
 
-    /// Adds a line.
+    /// Adds a line through `(x, y)` points.
     pub fn line(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Line, points.into_iter().collect())
     }
 
-    /// Adds a dashed line: a bound, a baseline, the truth.
+    /// Adds a dashed line, for a bound, a baseline or the true values.
     pub fn dashed(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Dashed, points.into_iter().collect())
     }
 
-    /// Adds points.
+    /// Adds points, which are not connected.
     pub fn points(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Points, points.into_iter().collect())
     }
 
-    /// Gives the series that was added last a colour of its own instead of the palette's next.
+    /// Sets the colour of the series added last; otherwise series take those of the [`PALETTE`] in turn.
     pub fn coloured(mut self, colour: RGBColor) -> Self {
         if let Some(last) = self.series.last_mut() {
             last.colour = Some(colour);
@@ -169,7 +170,7 @@ impl Chart {
         self
     }
 
-    /// Adds a band of `(x, low, high)`, in the colour of the line that was added last.
+    /// Adds a band between `low` and `high`, from `(x, low, high)`, in the colour of the series added before it.
     pub fn band(self, band: impl IntoIterator<Item = (f64, f64, f64)>) -> Self {
         let band: Vec<(f64, f64, f64)> = band.into_iter().collect();
         let low = band.iter().map(|(x, low, _)| (*x, *low));
@@ -183,10 +184,10 @@ impl Chart {
         self
     }
 
-    /// The chart as SVG.
+    /// Draws the chart and returns it as SVG, 680 by 340 pixels.
     ///
     /// # Errors
-    /// If nothing in it can be drawn: no finite point (on a logarithmic scale: no positive one).
+    /// If there is nothing to draw: no finite point (on a logarithmic scale, no positive one).
     pub fn svg(&self) -> Result<String> {
         let mut svg = String::new();
         self.draw_on(&draw::canvas(&mut svg, (680, 340))?, &Layout::ALONE)?;
@@ -199,7 +200,7 @@ impl Chart {
         let x = usable(self.x_range, self.x_log).or_else(|| span(shown().map(|(x, _)| *x), self.x_log));
         let y = usable(self.y_range, self.y_log).or_else(|| span(shown().map(|(_, y)| *y), self.y_log));
         let (Some((x0, x1)), Some((y0, y1))) = (x, y) else {
-            return Err(Error::BadSetting("chart: nothing in it can be drawn".into()));
+            return Err(Error::BadSetting("chart: there is nothing to draw".into()));
         };
         let drawn = match (self.x_log, self.y_log) {
             (false, false) => self.draw(area, layout, x0..x1, y0..y1),
@@ -215,7 +216,7 @@ impl Chart {
         x.is_finite() && y.is_finite() && (!self.x_log || x > 0.0) && (!self.y_log || y > 0.0)
     }
 
-    /// Shows it in a notebook; called by the kernel.
+    /// Displays the chart in a notebook; called by the evcxr kernel.
     pub fn evcxr_display(&self) {
         draw::display(self.svg());
     }

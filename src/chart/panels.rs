@@ -10,21 +10,21 @@ pub struct Panels {
 }
 
 impl Panels {
-    /// No charts yet; with an empty title, none is written.
+    /// No charts yet. An empty title takes no space.
     pub fn new(title: &str) -> Self {
         Self { title: title.into(), charts: Vec::new() }
     }
 
-    /// Adds a chart at the right.
+    /// Adds a chart to the right of the others.
     pub fn panel(mut self, chart: Chart) -> Self {
         self.charts.push(chart);
         self
     }
 
-    /// The charts as one SVG, 820 pixels wide and 440 high.
+    /// Draws the charts and returns them as one SVG, 820 by 440 pixels.
     ///
     /// # Errors
-    /// If there is no chart, or nothing in one of them can be drawn.
+    /// If there is nothing to draw in one of them.
     pub fn svg(&self) -> Result<String> {
         let mut svg = String::new();
         let area = draw::canvas(&mut svg, (820, 440))?;
@@ -40,7 +40,7 @@ impl Panels {
         Ok(svg)
     }
 
-    /// Shows them in a notebook; called by the kernel.
+    /// Displays the charts in a notebook; called by the evcxr kernel.
     pub fn evcxr_display(&self) {
         draw::display(self.svg());
     }

@@ -1,15 +1,27 @@
 //! Derivatives of steps and of roll-outs.
 //!
-//! *Forward mode* pushes one direction through everything: its cost grows with the number of actions. *Reverse mode*, the
-//! adjoint recursion, goes back through a roll-out once, whatever their number; it keeps all states (`N` numbers a step) and
-//! the Jacobians of one step at a time, which forward mode gives it.
+//! *Forward mode* pushes one direction through the roll-out: its cost grows with the number of actions. *Reverse mode* (the
+//! adjoint method, or backpropagation through time) goes back through the roll-out once, whatever their number; it keeps all
+//! states (`N` numbers a step) and the Jacobians of one step at a time, which forward mode computes.
+//!
+//! ```
+//! use handful::diff::derivatives::{gradient, gradient_forward};
+//! use handful::diff::CartPoleSwing;
+//! use handful::nalgebra::{Vector1, Vector4};
+//!
+//! let start = Vector4::new(0.0, 0.0, 3.0, 0.0);
+//! let actions = vec![Vector1::new(0.3); 20];
+//! let (_cost, reverse, _by_start) = gradient(&CartPoleSwing, &start, &actions);
+//! let forward = gradient_forward(&CartPoleSwing, &start, &actions);
+//! assert!(reverse.iter().zip(&forward).all(|(a, b)| (a - b).norm() < 1e-10));
+//! ```
 
 use nalgebra::{SMatrix, SVector};
 use num_dual::{Dual64, DualSVec64};
 
 use super::{System, roll_out};
 
-/// A step and how it changes with state and action.
+/// A step and its Jacobians: the linearised dynamics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Linear<const N: usize, const M: usize> {
     /// The state after the step.
@@ -20,7 +32,9 @@ pub struct Linear<const N: usize, const M: usize> {
     pub by_action: SMatrix<f64, N, M>,
 }
 
-/// The Jacobians of a step, exact.
+/// The exact Jacobians of a step, by forward mode.
+#[doc(alias = "linearize")]
+#[doc(alias = "Jacobian")]
 pub fn linearise<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     state: &SVector<f64, N>,
@@ -33,14 +47,21 @@ pub fn linearise<const N: usize, const M: usize>(
     Linear { next, by_state, by_action }
 }
 
-/// What a roll-out costs, and how that changes with every action and with the start: reverse mode.
+/// The cost of a roll-out and its gradients with respect to every action and to the start, by reverse mode. With the cost
+/// c of a step f, the adjoint lambda obeys (from the final cost's gradient backwards)
+///
+/// dJ/da_t = dc/da_t + (df/da_t)' lambda_{t+1},   lambda_t = dc/ds_t + (df/ds_t)' lambda_{t+1}.
+#[doc(alias = "adjoint")]
+#[doc(alias = "reverse mode")]
+#[doc(alias = "backpropagation through time")]
+#[doc(alias = "BPTT")]
 pub fn gradient<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     start: &SVector<f64, N>,
     actions: &[SVector<f64, M>],
 ) -> (f64, Vec<SVector<f64, M>>, SVector<f64, N>) {
     let (states, cost) = roll_out(system, start, actions);
-    // The adjoint: how the cost of all that is to come changes with the state.
+    // The adjoint: the gradient of the remaining cost with respect to the state.
     let (_, mut adjoint) = num_dual::gradient(|state| system.final_cost(&state), &states[actions.len()]);
     let mut by_actions = vec![SVector::zeros(); actions.len()];
     for (t, action) in actions.iter().enumerate().rev() {
@@ -57,6 +78,8 @@ pub fn gradient<const N: usize, const M: usize>(
 }
 
 /// The same gradient with respect to the actions by forward mode: a whole roll-out for each number of each action.
+#[doc(alias = "forward mode")]
+#[doc(alias = "dual numbers")]
 pub fn gradient_forward<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     start: &SVector<f64, N>,
@@ -75,7 +98,9 @@ pub fn gradient_forward<const N: usize, const M: usize>(
     slopes
 }
 
-/// The same by central differences: what everyone can do, and nobody should trust near contact.
+/// The same by central differences of width `step`, a check on the others. Near contact, where the cost bends within
+/// `step`, it is wrong.
+#[doc(alias = "finite differences")]
 pub fn gradient_by_differences<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     start: &SVector<f64, N>,

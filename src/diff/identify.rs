@@ -1,52 +1,66 @@
-//! System identification: what a block must be like to have moved as it did.
+//! System identification: estimates a block's mass and friction from a recorded push.
 //!
-//! A recorded push is played again in the [`Pusher`]; dual numbers tell how every recorded pose would change with the block's
-//! mass and friction, and Gauss-Newton steps (Levenberg's, damped) lead to those that explain it best. Both are sought as
-//! logarithms, since both are positive, and believed to lie near the guess as long as the recording does not say otherwise: a
-//! slow push tells next to nothing of a mass.
+//! The push is simulated in the [`Pusher`] with the recorded motion of the hand; dual numbers give the derivative of every pose
+//! with respect to mass and friction, and Levenberg-Marquardt steps (damped Gauss-Newton) minimise the squared error of the
+//! poses. The unknowns are logarithms, since mass and friction are positive, with a Gaussian prior around the guess (maximum a
+//! posteriori): a slow push tells next to nothing about a mass.
 
 use nalgebra::{SMatrix, SVector, Vector2};
 use num_dual::{Derivative, DualSVec64};
 
 use super::pusher::{DT, HALF, Pusher, SPEED, STATE};
 
-/// How far a guess may be off: the standard deviation of the two logarithms beforehand.
+/// Standard deviation of the prior on the two logarithms.
 const DOUBT: f64 = 1.0;
-/// What of a pose no simulator explains, m: the weight of the recording against the guess.
+/// Standard deviation of the error of a pose that no simulator explains, m: the weight of the recording against the prior.
 const NOISE: f64 = 1e-3;
 
-/// A push as it was seen, once each control step, the start included.
+/// A recorded push: one pose of hand and block for each control step, the start included.
+///
+/// ```
+/// use handful::diff::{Pusher, RecordedPush};
+///
+/// // A hand moves 10 cm along x and pushes the block before it.
+/// let hand: Vec<[f64; 2]> = (0..20).map(|t| [0.005 * t as f64, 0.001]).collect();
+/// let start = vec![[0.04, 0.0, 0.0]];
+/// let light = Pusher { mass: 0.05, friction: 0.3, ..Pusher::default() };
+/// let block = RecordedPush { hand: hand.clone(), block: start }.play(&light);
+///
+/// let found = RecordedPush { hand, block }.identify(Pusher::default());
+/// assert!(found.residual < 1e-3, "{} m", found.residual);
+/// ```
+#[doc(alias = "system identification")]
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RecordedPush {
-    /// Where the hand was, m.
+    /// Positions of the hand, m.
     pub hand: Vec<[f64; 2]>,
-    /// Where the block was, m, and its angle, rad.
+    /// Positions of the block, m, and its angle, rad.
     pub block: Vec<[f64; 3]>,
 }
 
-/// What was found.
+/// The result of [`RecordedPush::identify`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Identified {
     /// The block that explains the recording best.
     pub pusher: Pusher<f64>,
-    /// Standard deviations of the logarithms of mass and friction, if what is left unexplained is noise. Where they are near one
-    /// the recording has not told anything, and the guess was kept.
+    /// Standard deviations of the logarithms of mass and friction (Laplace approximation, the residual taken as noise). Near
+    /// one, that of the prior, the recording carries no information, and the guess was kept.
     pub deviations: [f64; 2],
-    /// Root mean square of what is left unexplained, m; angles count by how far they move the middle of an edge.
+    /// Root-mean-square residual, m; angles count by how far they move the middle of an edge.
     pub residual: f64,
     /// Gauss-Newton steps taken.
     pub iterations: usize,
 }
 
-/// Residuals of all poses, and their slopes with respect to the two logarithms.
+/// Residuals of all poses, and their gradients with respect to the two logarithms.
 struct Residuals {
     values: Vec<f64>,
     slopes: Vec<SVector<f64, 2>>,
 }
 
 impl RecordedPush {
-    /// Finds mass and friction near `guess`, whose grip and stiffness are kept. The block is taken to be at rest at first. A
-    /// whole trajectory has valleys that lead nowhere; so the search begins several times, a factor of three up and down too.
+    /// Estimates mass and friction near `guess`, whose other parameters are kept. The block starts at rest. The error of a whole
+    /// trajectory has local minima, so the search starts nine times: from the guess, and a factor of three above and below.
     pub fn identify(&self, guess: Pusher<f64>) -> Identified {
         const FACTORS: [f64; 3] = [1.0, 1.0 / 3.0, 3.0];
         let beginnings = FACTORS.iter().flat_map(|mass| FACTORS.map(|friction| Vector2::new(mass.ln(), friction.ln())));
@@ -55,7 +69,7 @@ impl RecordedPush {
         found
     }
 
-    /// Gauss-Newton steps from `off` the guess, in logarithms. Returns what was minimised, too.
+    /// Levenberg-Marquardt from `off`, the logarithm of the factors on the guess. Returns the minimised sum of squares, too.
     fn descend(&self, guess: &Pusher<f64>, off: Vector2<f64>) -> (f64, Identified) {
         const MOST: usize = 60;
         let mut at = off;
@@ -93,7 +107,7 @@ impl RecordedPush {
         (here.square(), identified)
     }
 
-    /// The poses that a block would have had under this hand.
+    /// The poses that the block of `pusher` has under the recorded motion of the hand.
     pub fn play(&self, pusher: &Pusher<f64>) -> Vec<[f64; 3]> {
         self.poses(pusher)
     }
@@ -104,7 +118,7 @@ impl RecordedPush {
         let pusher = guess.cast::<DualSVec64<2>>();
         let poses =
             self.poses(&Pusher { mass: pusher.mass * factor(0), friction: pusher.friction * factor(1), ..pusher });
-        // The guess is two residuals more.
+        // The prior is two more residuals.
         let mut residuals = Residuals {
             values: (off * (NOISE / DOUBT)).iter().copied().collect(),
             slopes: [0, 1].map(|i| direction(i) * (NOISE / DOUBT)).to_vec(),
@@ -140,7 +154,7 @@ impl Residuals {
         self.values.iter().map(|value| value * value).sum()
     }
 
-    /// Gauss-Newton's curvature and slope of half the square.
+    /// Gauss-Newton's normal equations: curvature and gradient of half the sum of squares.
     fn normal(&self) -> (SMatrix<f64, 2, 2>, SVector<f64, 2>) {
         let pairs = self.values.iter().zip(&self.slopes);
         pairs.fold((SMatrix::zeros(), SVector::zeros()), |(curvature, slope), (value, of)| {

@@ -1,9 +1,18 @@
-//! The iterative linear-quadratic regulator with bounded actions (Tassa, Mansard & Todorov 2014): along the best roll-out so
-//! far, dynamics are taken to be linear and costs to be quadratic; the best change of the actions then follows in one pass
-//! backwards, and a line search sees how much of it is true.
+//! The iterative linear-quadratic regulator (iLQR; Li & Todorov 2004) with bounded actions (box-DDP; Tassa, Mansard & Todorov
+//! 2014).
 //!
-//! Second derivatives of the dynamics are left out, as in Gauss and Newton's method. Costs are taken to be sums of a function
-//! of the state and one of the action.
+//! Each iteration linearises the dynamics and expands the cost to second order along the best trajectory so far. A backward
+//! pass then gives the best change of the actions, in closed form but for a small quadratic program at the bounds, and a
+//! forward pass with line search applies as much of it as lowers the cost. The backward pass is that of Tassa, Erez & Todorov
+//! (2012); regularisation is their first kind, on Q_uu.
+//!
+//! Second derivatives of the dynamics are left out (Gauss-Newton; with them it would be DDP), and so are mixed second
+//! derivatives of the cost, which is taken to be a function of the state plus one of the action.
+//!
+//! - W. Li, E. Todorov: "Iterative linear quadratic regulator design for nonlinear biological movement systems", ICINCO 2004.
+//! - Y. Tassa, T. Erez, E. Todorov: "Synthesis and stabilization of complex behaviors through online trajectory
+//!   optimization", IROS 2012.
+//! - Y. Tassa, N. Mansard, E. Todorov: "Control-limited differential dynamic programming", ICRA 2014.
 
 use nalgebra::{SMatrix, SVector};
 use num_dual::Dual2SVec64;
@@ -18,9 +27,9 @@ use super::{System, roll_out};
 pub struct IlqrConfig {
     /// Iterations at most.
     pub iterations: usize,
-    /// It ends when an iteration lowers the cost by less than this share of it.
+    /// Converged when an iteration lowers the cost by less than this fraction of it.
     pub tolerance: f64,
-    /// What is added to the curvature at the start, and how it grows and shrinks.
+    /// Initial regularisation of Q_uu; it grows by 4 when an iteration fails and shrinks by 8 after each.
     pub regularisation: f64,
 }
 
@@ -30,49 +39,56 @@ impl Default for IlqrConfig {
     }
 }
 
-/// Regularisation beyond this means that there is nothing more to be found.
-const MOST_REGULARISATION: f64 = 1e10;
-/// The shares of a change that the line search tries.
-const SHARES: [f64; 8] = [1.0, 0.6, 0.35, 0.2, 0.1, 0.05, 0.02, 0.01];
+/// Beyond this regularisation no further improvement is expected.
+const MAX_REGULARISATION: f64 = 1e10;
+/// The step sizes that the line search tries.
+const STEP_SIZES: [f64; 8] = [1.0, 0.6, 0.35, 0.2, 0.1, 0.05, 0.02, 0.01];
 
-/// What it found.
+/// The result of [`Ilqr::solve`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Solution<const N: usize, const M: usize> {
     /// The actions, each number in [-1, 1].
     pub actions: Vec<SVector<f64, M>>,
-    /// The states that they lead through, the start included.
+    /// The trajectory of states, the start included.
     pub states: Vec<SVector<f64, N>>,
-    /// How actions should answer to states that are not those.
+    /// Feedback gains K, one for each action: off the trajectory, add K (state - planned state).
     pub gains: Vec<SMatrix<f64, M, N>>,
-    /// What it costs.
+    /// Total cost.
     pub cost: f64,
-    /// Iterations that it took.
+    /// Iterations taken.
     pub iterations: usize,
-    /// Steps simulated on the way, those that were differentiated among them (each counts once).
+    /// Steps simulated; a step that was differentiated counts once.
     pub steps: usize,
 }
 
-/// The optimiser.
+/// The optimiser; the [module](crate::diff) has an example.
+#[doc(alias = "iLQR")]
+#[doc(alias = "iLQG")]
+#[doc(alias = "DDP")]
+#[doc(alias = "differential dynamic programming")]
+#[doc(alias = "trajectory optimisation")]
 #[derive(Clone, Debug, Default)]
 pub struct Ilqr {
     config: IlqrConfig,
 }
 
-/// A change of the actions that a pass backwards proposes.
+/// A change of the actions, as the backward pass proposes it.
 struct Change<const N: usize, const M: usize> {
-    open: Vec<SVector<f64, M>>,
+    /// Open-loop terms k.
+    open_loop: Vec<SVector<f64, M>>,
+    /// Feedback gains K.
     gains: Vec<SMatrix<f64, M, N>>,
-    /// By how much it should lower the cost: the linear and the quadratic part.
-    promised: [f64; 2],
+    /// The expected change of the cost: the terms linear and quadratic in the step size.
+    expected: [f64; 2],
 }
 
 impl Ilqr {
-    /// With these settings.
+    /// An optimiser with these settings.
     pub fn new(config: IlqrConfig) -> Self {
         Self { config }
     }
 
-    /// Improves `guess`, from `start`.
+    /// Optimises the actions of a roll-out from `start`, beginning with `guess`, which is as long as the solution.
     pub fn solve<const N: usize, const M: usize>(
         &self,
         system: &impl System<N, M>,
@@ -92,12 +108,12 @@ impl Ilqr {
             let before = best.cost;
             let improved = loop {
                 if let Some(change) = backward(system, &best, &lines, regularisation)
-                    && try_out(system, &mut best, &change)
+                    && forward(system, &mut best, &change)
                 {
                     break true;
                 }
                 regularisation *= 4.0;
-                if regularisation > MOST_REGULARISATION {
+                if regularisation > MAX_REGULARISATION {
                     break false;
                 }
             };
@@ -110,23 +126,39 @@ impl Ilqr {
     }
 }
 
-/// Receding-horizon control with it: at every step the last solution, moved on, is improved a little.
+/// Receding-horizon control (MPC) with [`Ilqr`], warm-started: at every step the last solution is shifted and improved.
+///
+/// ```
+/// use handful::diff::{Ilqr, IlqrConfig, IlqrControl, PendulumSwing, System};
+/// use handful::nalgebra::{Vector1, Vector2};
+///
+/// let ilqr = Ilqr::new(IlqrConfig { iterations: 5, ..IlqrConfig::default() });
+/// let mut control = IlqrControl::new(ilqr, vec![Vector1::new(0.0); 30]);
+/// let mut state = Vector2::new(0.2, 0.0);
+/// for _ in 0..60 {
+///     let (action, _) = control.act(&PendulumSwing, &state);
+///     state = PendulumSwing.step(&state, &action);
+/// }
+/// assert!(state.norm() < 0.05, "balanced upright");
+/// ```
+#[doc(alias = "MPC")]
+#[derive(Clone, Debug)]
 pub struct IlqrControl<const M: usize> {
     ilqr: Ilqr,
     ahead: Vec<SVector<f64, M>>,
 }
 
 impl<const M: usize> IlqrControl<M> {
-    /// A controller that begins with a guess as long as it is to look ahead.
+    /// A controller whose planning horizon is the length of `guess`, its first plan.
     ///
     /// # Panics
     /// If the guess is empty.
     pub fn new(ilqr: Ilqr, guess: Vec<SVector<f64, M>>) -> Self {
-        assert!(!guess.is_empty(), "at least one step to look ahead");
+        assert!(!guess.is_empty(), "a horizon of at least one step");
         Self { ilqr, ahead: guess }
     }
 
-    /// The next action, and the solution that it is the first of.
+    /// The next action, and the solution whose first action it is.
     pub fn act<const N: usize>(
         &mut self,
         system: &impl System<N, M>,
@@ -140,7 +172,13 @@ impl<const M: usize> IlqrControl<M> {
     }
 }
 
-/// The pass backwards. `None` if the curvature is not positive, so that no best change exists.
+/// The backward pass (Tassa et al. 2012, Eqs. 5 and 11): from the end, with the value function V' of the next step,
+///
+/// Qx = cx + fx' Vx',  Qu = cu + fu' Vx',  Qxx = cxx + fx' Vxx' fx,  Qux = fu' Vxx' fx,  Quu = cuu + fu' Vxx' fu,
+/// k = argmin of k' Quu k / 2 + Qu' k within the bounds,  K = -Quu^-1 Qux for free actions,
+/// Vx = Qx + K' Quu k + K' Qu + Qux' k,  Vxx = Qxx + K' Quu K + K' Qux + Qux' K.
+///
+/// None if the regularised Quu is not positive definite.
 fn backward<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     about: &Solution<N, M>,
@@ -148,51 +186,52 @@ fn backward<const N: usize, const M: usize>(
     regularisation: f64,
 ) -> Option<Change<N, M>> {
     let end = &about.states[lines.len()];
-    let (_, mut slope, mut curvature) = num_dual::hessian(|state| system.final_cost(&state), end);
+    let (_, mut v_x, mut v_xx) = num_dual::hessian(|state| system.final_cost(&state), end);
     let mut change =
-        Change { open: vec![SVector::zeros(); lines.len()], gains: about.gains.clone(), promised: [0.0; 2] };
-    for (t, Linear { by_state, by_action, .. }) in lines.iter().enumerate().rev() {
+        Change { open_loop: vec![SVector::zeros(); lines.len()], gains: about.gains.clone(), expected: [0.0; 2] };
+    for (t, Linear { by_state: f_x, by_action: f_u, .. }) in lines.iter().enumerate().rev() {
         let (state, action) = (&about.states[t], &about.actions[t]);
         let fixed = action.map(Dual2SVec64::from_re);
-        let (_, of_state, by_states) = num_dual::hessian(|state| system.cost(&state, &fixed), state);
+        let (_, c_x, c_xx) = num_dual::hessian(|state| system.cost(&state, &fixed), state);
         let fixed = state.map(Dual2SVec64::from_re);
-        let (_, of_action, by_actions) = num_dual::hessian(|action| system.cost(&fixed, &action), action);
+        let (_, c_u, c_uu) = num_dual::hessian(|action| system.cost(&fixed, &action), action);
 
-        let q_state = of_state + by_state.tr_mul(&slope);
-        let q_action = of_action + by_action.tr_mul(&slope);
-        let q_states = by_states + by_state.tr_mul(&curvature) * by_state;
-        let q_mixed = by_action.tr_mul(&curvature) * by_state;
-        let q_actions = by_actions + by_action.tr_mul(&curvature) * by_action;
-        let regular = q_actions + SMatrix::<f64, M, M>::identity() * regularisation;
+        let q_x = c_x + f_x.tr_mul(&v_x);
+        let q_u = c_u + f_u.tr_mul(&v_x);
+        let q_xx = c_xx + f_x.tr_mul(&v_xx) * f_x;
+        let q_ux = f_u.tr_mul(&v_xx) * f_x;
+        let q_uu = c_uu + f_u.tr_mul(&v_xx) * f_u;
+        let regularised = q_uu + SMatrix::<f64, M, M>::identity() * regularisation;
         let bounds = [action.map(|a| -1.0 - a), action.map(|a| 1.0 - a)];
-        let (open, free) = within_bounds(&regular, &q_action, bounds)?;
-        // Actions that lie at their bound do not answer to the state.
-        let gain = -solve_free(&regular, &q_mixed, &free)?;
+        let (open_loop, free) = box_qp(&regularised, &q_u, bounds)?;
+        // Actions at a bound have no feedback.
+        let gain = -solve_free(&regularised, &q_ux, &free)?;
 
-        change.promised[0] += open.dot(&q_action);
-        change.promised[1] += 0.5 * open.dot(&(q_actions * open));
-        slope = q_state + gain.tr_mul(&(q_actions * open)) + gain.tr_mul(&q_action) + q_mixed.tr_mul(&open);
-        curvature = q_states + gain.tr_mul(&(q_actions * gain)) + gain.tr_mul(&q_mixed) + q_mixed.tr_mul(&gain);
-        curvature = (curvature + curvature.transpose()) * 0.5;
-        (change.open[t], change.gains[t]) = (open, gain);
+        change.expected[0] += open_loop.dot(&q_u);
+        change.expected[1] += 0.5 * open_loop.dot(&(q_uu * open_loop));
+        v_x = q_x + gain.tr_mul(&(q_uu * open_loop)) + gain.tr_mul(&q_u) + q_ux.tr_mul(&open_loop);
+        v_xx = q_xx + gain.tr_mul(&(q_uu * gain)) + gain.tr_mul(&q_ux) + q_ux.tr_mul(&gain);
+        v_xx = (v_xx + v_xx.transpose()) * 0.5;
+        (change.open_loop[t], change.gains[t]) = (open_loop, gain);
     }
     Some(change)
 }
 
-/// Tries larger and smaller shares of a change; takes over the first that lowers the cost by a fair part of what was promised.
-fn try_out<const N: usize, const M: usize>(
+/// The forward pass with line search: rolls out u + alpha k + K (x' - x) for smaller and smaller alpha, and accepts the first
+/// that lowers the cost by a fraction of what was expected.
+fn forward<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     best: &mut Solution<N, M>,
     change: &Change<N, M>,
 ) -> bool {
-    let [linear, quadratic] = change.promised;
-    for share in SHARES {
+    let [linear, quadratic] = change.expected;
+    for alpha in STEP_SIZES {
         let mut states = vec![best.states[0]];
         let mut actions = Vec::with_capacity(best.actions.len());
         let mut cost = 0.0;
         for (t, before) in best.actions.iter().enumerate() {
             let state = states[t];
-            let action = before + change.open[t] * share + change.gains[t] * (state - best.states[t]);
+            let action = before + change.open_loop[t] * alpha + change.gains[t] * (state - best.states[t]);
             let action = action.map(|a| a.clamp(-1.0, 1.0));
             cost += system.cost(&state, &action);
             states.push(system.step(&state, &action));
@@ -200,8 +239,8 @@ fn try_out<const N: usize, const M: usize>(
         }
         cost += system.final_cost(&states[actions.len()]);
         best.steps += actions.len();
-        let promised = -(share * linear + share * share * quadratic);
-        if cost.is_finite() && best.cost - cost > 1e-4 * promised.max(0.0) && cost < best.cost {
+        let expected = -(alpha * linear + alpha * alpha * quadratic);
+        if cost.is_finite() && best.cost - cost > 1e-4 * expected.max(0.0) && cost < best.cost {
             (best.states, best.actions, best.cost) = (states, actions, cost);
             best.gains.clone_from(&change.gains);
             return true;
@@ -210,9 +249,9 @@ fn try_out<const N: usize, const M: usize>(
     false
 }
 
-/// The change x within bounds that minimises `x' H x / 2 + g' x`, and which of its numbers are free, by projected Newton
-/// steps. `None` if H is not positive definite.
-fn within_bounds<const M: usize>(
+/// The box-constrained quadratic program of box-DDP (Tassa et al. 2014): the x within bounds that minimises x' H x / 2 + g' x,
+/// and which of its numbers are free (not held at a bound), by projected Newton steps. None if H is not positive definite.
+fn box_qp<const M: usize>(
     h: &SMatrix<f64, M, M>,
     g: &SVector<f64, M>,
     [low, high]: [SVector<f64, M>; 2],
@@ -222,24 +261,24 @@ fn within_bounds<const M: usize>(
     let mut x = clamped(SVector::zeros());
     let mut free = [true; M];
     for _ in 0..20 {
-        let slope = g + h * x;
-        free = std::array::from_fn(|i| !(x[i] <= low[i] && slope[i] > 0.0 || x[i] >= high[i] && slope[i] < 0.0));
-        let step = -solve_free(h, &slope, &free)?;
+        let gradient = g + h * x;
+        free = std::array::from_fn(|i| !(x[i] <= low[i] && gradient[i] > 0.0 || x[i] >= high[i] && gradient[i] < 0.0));
+        let step = -solve_free(h, &gradient, &free)?;
         if step.norm() < 1e-10 {
             break;
         }
-        let mut share = 1.0;
+        let mut alpha = 1.0;
         let mut next = clamped(x + step);
-        while value(&next) > value(&x) - 1e-12 && share > 1e-3 {
-            share *= 0.5;
-            next = clamped(x + step * share);
+        while value(&next) > value(&x) - 1e-12 && alpha > 1e-3 {
+            alpha *= 0.5;
+            next = clamped(x + step * alpha);
         }
         x = next;
     }
     Some((x, free))
 }
 
-/// `H^-1 b` among the free numbers; zero for the others. `None` if H is not positive definite there.
+/// H^-1 b among the free numbers; zero for the others. None if H is not positive definite there.
 fn solve_free<const M: usize, const C: usize>(
     h: &SMatrix<f64, M, M>,
     b: &SMatrix<f64, M, C>,
@@ -257,13 +296,13 @@ fn solve_free<const M: usize, const C: usize>(
 mod tests {
     use super::*;
 
-    /// Minimum of a bowl whose bottom lies outside: at the bound in one number, and best in the other given that.
+    /// A quadratic whose minimum lies outside the bounds: at the bound in one number, and optimal in the other given that.
     #[test]
     fn a_bounded_minimum_is_found() {
         let h = SMatrix::<f64, 2, 2>::new(2.0, 1.0, 1.0, 2.0);
         let g = SVector::<f64, 2>::new(-8.0, 0.0);
         let bounds = [SVector::repeat(-1.0), SVector::repeat(1.0)];
-        let (x, free) = within_bounds(&h, &g, bounds).expect("positive definite");
+        let (x, free) = box_qp(&h, &g, bounds).expect("positive definite");
         assert!((x[0] - 1.0).abs() < 1e-9 && (x[1] + 0.5).abs() < 1e-9, "{x}");
         assert_eq!(free, [false, true]);
     }

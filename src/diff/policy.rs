@@ -1,8 +1,10 @@
-//! Analytic policy gradients: a policy that learns by differentiating what it does, through the simulator, all the way.
+//! Analytic policy gradients: a policy network trained by backpropagation through time, through a differentiable simulator.
 //!
-//! Each update runs several worlds a window of steps ahead, adds up what that costs, and goes back through simulator and
-//! network alike: the simulator's Jacobians come from dual numbers, the network's from dfdx's tape, on which both are recorded.
-//! Where a window ends, the worlds go on from there in the next one, and the gradient does not (truncation).
+//! Each update rolls several systems out for a short horizon (the window), sums their costs, and differentiates the sum through
+//! simulator and network: the simulator's Jacobians come from dual numbers, the network's from dfdx's tape, on which both
+//! are recorded. The next window goes on from the states where this one ended, but no gradient flows between windows
+//! (truncated backpropagation). Short windows are the idea of SHAC (Xu et al. 2022); unlike there, no critic values the
+//! state that a window ends in.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -15,31 +17,31 @@ use crate::nn::ops::{join, map_rows, record, total};
 use crate::nn::{Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, Tensor3, device, tensor, values};
 use crate::rng::Rng;
 
-/// A [`System`] that a policy can live in.
+/// A [`System`] as an environment for [`AnalyticPolicyGradient`]: with observations of `O` numbers and initial states.
 pub trait PolicyEnv<const N: usize, const M: usize, const O: usize>: System<N, M> {
-    /// What a policy sees of a state: numbers of size one.
+    /// The observation of a state, numbers of order one.
     fn observe<S: nalgebra::RealField + Copy>(&self, state: &SVector<S, N>) -> SVector<S, O>;
 
-    /// A state to begin with.
+    /// A random initial state.
     fn start(&self, rng: &mut Rng) -> SVector<f64, N>;
 }
 
-/// Settings of a [`AnalyticPolicyGradient`].
+/// Settings of [`AnalyticPolicyGradient`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AnalyticPolicyGradientConfig {
     /// Width of each hidden layer.
     pub hidden: Vec<usize>,
-    /// Step size.
+    /// Learning rate of Adam.
     pub learning_rate: f32,
-    /// Gradients are shortened to this norm: across contact, or in a chaotic world, they explode.
+    /// Gradients are clipped to this norm: through contact, or in chaotic dynamics, they explode.
     pub max_norm: f32,
-    /// Worlds side by side.
+    /// Systems simulated in parallel.
     pub worlds: usize,
-    /// Steps that are differentiated through.
+    /// Steps that gradients flow through.
     pub window: usize,
-    /// Steps after which a world begins anew. Short, or the worlds of a policy that can already hold its place show it
-    /// nothing else, and it forgets how it got there.
+    /// Steps in an episode, after which a system starts anew. If episodes are long, a policy that balances well sees nothing
+    /// but balancing, and forgets how to get there.
     pub episode: usize,
 }
 
@@ -49,19 +51,36 @@ impl Default for AnalyticPolicyGradientConfig {
     }
 }
 
-/// A policy and the worlds that it learns in.
+/// A policy network and the systems that it is trained on.
+///
+/// ```
+/// use handful::diff::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PendulumSwing};
+/// use handful::nalgebra::Vector3;
+/// use handful::rng;
+///
+/// let mut rng = rng::stream(0, "example");
+/// let mut training = AnalyticPolicyGradient::new(&PendulumSwing, AnalyticPolicyGradientConfig::default(), &mut rng);
+/// let mean_cost = training.update(&PendulumSwing, &mut rng);
+/// assert!(mean_cost > 0.0 && training.steps == 4 * 32);
+/// let torque = training.act(&Vector3::new(-1.0, 0.0, 0.0))[0];
+/// assert!((-1.0..=1.0).contains(&torque));
+/// ```
+#[doc(alias = "APG")]
+#[doc(alias = "SHAC")]
+#[doc(alias = "short-horizon actor-critic")]
+#[doc(alias = "backpropagation through time")]
 pub struct AnalyticPolicyGradient<const N: usize, const M: usize, const O: usize> {
     config: AnalyticPolicyGradientConfig,
     policy: Mlp,
     optimiser: Adam,
-    /// Each world's state and age, steps.
+    /// State and age (steps) of each system.
     worlds: Vec<(SVector<f64, N>, usize)>,
     /// Steps simulated so far.
     pub steps: usize,
 }
 
 impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M, O> {
-    /// A policy that does next to nothing yet.
+    /// An untrained policy, whose actions are near zero.
     pub fn new(system: &impl PolicyEnv<N, M, O>, config: AnalyticPolicyGradientConfig, rng: &mut Rng) -> Self {
         let shape = MlpConfig {
             members: 1,
@@ -73,7 +92,7 @@ impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M
             init: Init::TruncatedNormal,
         };
         let optimiser = AdamConfig { max_norm: Some(config.max_norm), ..AdamConfig::new(config.learning_rate) };
-        // Of different ages, so that they do not all begin anew at once.
+        // Of different ages, so that they do not all start anew at once.
         let apart = config.episode / config.worlds;
         Self {
             policy: Mlp::new(&device(), &shape, rng).scale_output(0.1),
@@ -84,13 +103,13 @@ impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M
         }
     }
 
-    /// What the policy does.
+    /// The policy's action for an observation, each number in [-1, 1].
     pub fn act(&self, observation: &SVector<f32, O>) -> SVector<f32, M> {
         let seen = tensor(&device(), observation.as_slice().to_vec(), (1, 1, O));
         SVector::from_column_slice(values(&self.policy.forward(seen, Grad::Input).tanh()))
     }
 
-    /// One gradient step. Returns what a step has cost on average.
+    /// One gradient step on one window of every system. Returns the mean cost of a step.
     pub fn update(&mut self, system: &impl PolicyEnv<N, M, O>, rng: &mut Rng) -> f32 {
         let AnalyticPolicyGradientConfig { window, episode, .. } = self.config;
         for (state, age) in self.worlds.iter_mut().filter(|(_, age)| *age >= episode) {
@@ -124,7 +143,7 @@ fn part<const N: usize>(x: &[Dual64]) -> SVector<Dual64, N> {
     SVector::from_column_slice(x)
 }
 
-/// A function of the simulator's, of each row. Its Jacobian: a dual number in each input by turns.
+/// Applies a function of the simulator to each row of `x`; its Jacobian by forward mode, a dual number in each input in turn.
 fn simulated<T: Tape<f32, Cpu>>(x: Tensor3<T>, outputs: usize, f: impl Fn(&[Dual64]) -> Vec<Dual64>) -> Tensor3<T> {
     map_rows(x, outputs, |_, row, value, jacobian| {
         let mut inputs: Vec<Dual64> = row.iter().map(|x| Dual64::from_re(f64::from(*x))).collect();

@@ -1,4 +1,4 @@
-//! The classics, to be swung up: the equations are those of [`crate::env`].
+//! Swing-up of pendulum and cart-pole as differentiable systems; the equations are those of [`crate::env`].
 
 use std::f64::consts::PI;
 
@@ -8,8 +8,8 @@ use super::{PolicyEnv, System};
 use crate::env::{cartpole, pendulum};
 use crate::rng::{Rng, uniform};
 
-/// The pendulum: angle from upright and angular velocity; the action is a torque divided by 2 N m. The cost is smooth, where
-/// the environment's has a kink as the angle wraps; near upright and when hanging it is much the same.
+/// The pendulum: angle from upright (rad) and angular velocity (rad/s); the action is a torque divided by 2 N m. The cost is
+/// smooth where the environment's has a kink as the angle wraps; near upright and hanging the two are close.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct PendulumSwing;
 
@@ -31,7 +31,7 @@ impl System<2, 1> for PendulumSwing {
     }
 }
 
-/// Sees what the environment shows, and starts as it does.
+/// The environment's observations and initial states.
 impl PolicyEnv<2, 1, 3> for PendulumSwing {
     fn observe<S: RealField + Copy>(&self, state: &SVector<S, 2>) -> SVector<S, 3> {
         SVector::from([state[0].cos(), state[0].sin(), state[1]])
@@ -42,8 +42,8 @@ impl PolicyEnv<2, 1, 3> for PendulumSwing {
     }
 }
 
-/// The cart-pole, from hanging to upright in the middle: position, velocity, angle, angular velocity; the action is a force
-/// divided by 10 N.
+/// The cart-pole, from hanging to upright in the middle: position (m), velocity (m/s), angle from upright (rad), angular
+/// velocity (rad/s); the action is a force divided by 10 N.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct CartPoleSwing;
 

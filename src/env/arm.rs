@@ -3,6 +3,15 @@
 //! Everything that makes a Panda a Panda stands in [`ArmDescription::panda`]; kinematics, controller
 //! and physics read it and know no number of their own. Another seven-joint arm is another
 //! description. The numbers are those of robosuite 1.5.2's Panda, which differ from the real robot's.
+//!
+//! ```
+//! use handful::env::arm::{ArmDescription, JOINTS};
+//!
+//! let panda = ArmDescription::panda();
+//! assert_eq!((panda.links.len(), panda.gripper.range), (JOINTS, [0.0, 0.04]));
+//! let mass: f64 = panda.links.iter().map(|link| link.inertia.mass).sum();
+//! assert!((mass - 14.8).abs() < 1e-9, "{mass} kg with the hand");
+//! ```
 
 use nalgebra::{Isometry3, Matrix3, Quaternion, SVector, Translation3, UnitQuaternion, Vector3};
 
@@ -18,9 +27,9 @@ pub type Pose = Isometry3<f64>;
 /// A collision and drawing primitive, placed in the frame of its body.
 #[derive(Clone, Debug)]
 pub struct Primitive {
-    /// What it is.
+    /// Its shape.
     pub kind: PrimitiveKind,
-    /// Where it is in the body's frame.
+    /// Its pose in the body's frame.
     pub pose: Pose,
 }
 
@@ -78,7 +87,7 @@ impl Inertia {
         Self { mass, com: com.into(), tensor: Matrix3::from_diagonal(&principal.into()) }
     }
 
-    /// The same body seen from a frame in which its own frame stands at `pose`.
+    /// The same body in a frame in which its own frame has pose `pose`.
     pub fn seen_at(&self, pose: &Pose) -> Self {
         let r = pose.rotation.to_rotation_matrix();
         Self {
@@ -117,7 +126,7 @@ pub struct LinkDescription {
     pub max_torque: f64,
     /// The link's inertia; the last link's includes the hand that is bolted to it.
     pub inertia: Inertia,
-    /// What the link collides and is drawn with.
+    /// Shapes of the link, for collisions and drawing.
     pub shapes: Vec<Primitive>,
     /// Whether the shapes collide (the links near the base never reach anything).
     pub collides: bool,
@@ -157,11 +166,11 @@ pub struct GripperDescription {
 /// A seven-joint arm with a two-finger gripper.
 #[derive(Clone, Debug)]
 pub struct ArmDescription {
-    /// What it is called.
+    /// Its name.
     pub name: &'static str,
-    /// Where the base stands in the world.
+    /// Pose of the base in the world frame.
     pub base: Pose,
-    /// What the base is drawn with.
+    /// Shapes of the base, for drawing.
     pub base_shapes: Vec<Primitive>,
     /// The links from the base to the hand.
     pub links: [LinkDescription; JOINTS],

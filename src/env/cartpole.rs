@@ -1,7 +1,19 @@
 //! `cartpole`: balance a pole on a cart by pushing the cart with any force up to 10 N.
 //!
-//! The continuous cart-pole of the PETS literature as mbrl-lib has it: Gym's equations, the force
+//! The continuous cart-pole of the PETS literature as mbrl-lib has it: the equations of Gym's CartPole-v1, the force
 //! proportional to the action, reward 1 while the pole stands, 200 steps.
+//!
+//! ```
+//! use handful::env::cartpole::CartPole;
+//! use handful::prelude::*;
+//!
+//! let mut env = CartPole::default();
+//! let obs = env.reset(0); // position (m), velocity (m/s), angle (rad), angular velocity (rad/s)
+//! let step = env.step(&[0.1])?; // 1 N
+//! assert!(step.success && step.reward == 1.0);
+//! assert!(env.terminated(&[0.0, 0.0, 0.3, 0.0]), "0.3 rad is too far from upright");
+//! # Ok::<(), Error>(())
+//! ```
 
 use nalgebra::{RealField, UnitQuaternion, Vector3};
 
@@ -71,6 +83,7 @@ pub fn roll<S: RealField + Copy>([position, velocity, angle, spin]: [S; 4], forc
 }
 
 /// The environment: observes the state; an action is a force divided by 10 N.
+#[derive(Clone, Debug)]
 pub struct CartPole {
     spec: Spec,
     state: CartPoleState,

@@ -1,4 +1,19 @@
-//! Where the arm's links are, how the hand moves with the joints, and how heavy the joints feel.
+//! Forward kinematics of the arm, Jacobians of the hand, and the joint-space mass matrix.
+//!
+//! ```
+//! use handful::env::arm::{ArmDescription, JointVector};
+//! use handful::env::kinematics::KinematicModel;
+//!
+//! let arm = ArmDescription::panda();
+//! let model = KinematicModel::new(&arm);
+//! let home = model.at(&arm.home);
+//! // The Jacobian is the derivative of the hand's position.
+//! let mut q = arm.home;
+//! q[3] += 1e-6;
+//! let moved = (model.at(&q).grip.translation.vector - home.grip.translation.vector) / 1e-6;
+//! assert!((moved - home.linear.column(3)).norm() < 1e-5);
+//! assert!(home.coriolis(&JointVector::zeros()).norm() == 0.0);
+//! ```
 
 use nalgebra::{SMatrix, Vector3};
 
@@ -13,7 +28,7 @@ pub type MassMatrix = SMatrix<f64, JOINTS, JOINTS>;
 /// Downward acceleration, m/s2.
 pub const GRAVITY: f64 = 9.81;
 
-/// Everything that follows from the joint angles alone. World frame throughout.
+/// Everything that follows from the joint angles alone, in the world frame.
 #[derive(Clone, Debug)]
 pub struct Kinematics {
     /// Pose of each link.
@@ -26,9 +41,9 @@ pub struct Kinematics {
     pub angular: Jacobian,
     /// Joint-space inertia with rotor inertias, kg m2.
     pub mass: MassMatrix,
-    /// Torques that hold the arm up against gravity, N m.
+    /// Joint torques that compensate gravity, N m.
     pub gravity: JointVector,
-    /// Mass, centre of mass and inertia of each link as they stand in the world.
+    /// Mass, centre of mass and inertia of each link in the world frame.
     bodies: [Inertia; JOINTS],
     /// Direction of each joint's axis.
     axes: [Vector3<f64>; JOINTS],

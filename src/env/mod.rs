@@ -1,8 +1,30 @@
-//! Worlds to act in.
+//! Environments: what an agent acts in, after Gymnasium's `reset` and `step`.
 //!
-//! [`Env`] is all that an agent asks of a world; implement it and every agent here trains on it.
-//! [`KnownReward`] and [`Snapshot`] are what planners ask beyond that. [`World`] is any of the
-//! worlds of this crate, by name.
+//! [`Env`] is all that training requires; implement it, and every agent here trains on it. Two more traits open more doors:
+//! [`KnownReward`] for planners that compute rewards from predicted observations, [`Snapshot`] for those that plan on the
+//! true dynamics. [`contract`] enforces the rules of [`Env`], [`vector`] steps many environments in parallel.
+//!
+//! [`World`] is any of this crate's environments, made by name ([`Task`]): four tasks for a robot arm ([`tabletop`]), the
+//! [`pendulum`] and the [`cartpole`].
+//!
+//! ```
+//! use handful::prelude::*;
+//!
+//! let mut env = Task::Pendulum.make();
+//! let mut obs = env.reset(0);
+//! let mut total = 0.0;
+//! loop {
+//!     // A brake: torque against the angular velocity, in [-1, 1].
+//!     let step = env.step(&[-obs[2]])?;
+//!     total += step.reward;
+//!     if step.done() {
+//!         break;
+//!     }
+//!     obs = step.observation;
+//! }
+//! assert!(total < 0.0);
+//! # Ok::<(), Error>(())
+//! ```
 
 pub mod arm;
 pub mod cartpole;
@@ -12,186 +34,15 @@ pub mod osc;
 pub mod pendulum;
 pub mod physics;
 pub mod scene;
+mod spec;
 pub mod tabletop;
 pub mod vector;
 mod world;
 
+pub use spec::{Feature, Role, Spec};
 pub use world::{Task, World, WorldState};
 
-use crate::error::{Error, Result};
-
-/// The names, sizes and units of an environment's observations and actions.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub struct Spec {
-    /// The environment's name.
-    pub name: String,
-    /// What each number of an observation is.
-    pub observation: Vec<Feature>,
-    /// Numbers in an action; each lies in [-1, 1].
-    pub action_size: usize,
-    /// Control steps in an episode; its end by the clock is a truncation, not a termination.
-    pub horizon: usize,
-    /// Seconds from one action to the next.
-    pub dt: f64,
-    /// The stages on the way to success, in order, for reports.
-    pub stages: Vec<String>,
-}
-
-/// One number of an observation.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub struct Feature {
-    /// Its name, with its unit where it has one.
-    pub name: String,
-    /// A typical value.
-    pub centre: f32,
-    /// A typical distance from `centre`: networks are fed (value - centre) / scale.
-    pub scale: f32,
-    /// Its part in the course of events: models predict only what has a course of its own.
-    pub role: Role,
-    /// The cube to whose axes it belongs, if it does. Of each cube six features say how it lies: the directions of its
-    /// x-axis and of its z-axis, in this order. Nobody can tell a cube's sides apart, and models need not.
-    pub cube: Option<String>,
-}
-
-/// What part a number has in the course of events.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Role {
-    /// It has a course of its own.
-    #[default]
-    Dynamic,
-    /// It stays as it is through an episode: a goal.
-    Constant,
-    /// It is the difference of two others, which are named.
-    Difference {
-        /// From this
-        minuend: String,
-        /// this is subtracted.
-        subtrahend: String,
-    },
-}
-
-impl Feature {
-    /// A feature around zero of size one.
-    pub fn new(name: impl Into<String>) -> Self {
-        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::Dynamic, cube: None }
-    }
-
-    /// The same feature, which stays as it is through an episode.
-    pub fn constant(self) -> Self {
-        Self { role: Role::Constant, ..self }
-    }
-
-    /// The same feature, which is the difference of two others.
-    pub fn difference(self, minuend: impl Into<String>, subtrahend: impl Into<String>) -> Self {
-        Self { role: Role::Difference { minuend: minuend.into(), subtrahend: subtrahend.into() }, ..self }
-    }
-
-    /// The same feature, if it says how a cube lies.
-    pub fn axis_of_cube(self, cube: &str) -> Self {
-        Self { cube: Some(cube.into()), ..self }
-    }
-
-    /// The same feature around another centre and of another size.
-    pub fn around(self, centre: f32, scale: f32) -> Self {
-        Self { centre, scale, ..self }
-    }
-}
-
-impl Spec {
-    /// An environment with these numbers in its observations, `action_size` numbers in [-1, 1] as its action, episodes of
-    /// at most `horizon` control steps, and `dt` seconds from one action to the next.
-    pub fn new(
-        name: impl Into<String>,
-        observation: impl IntoIterator<Item = Feature>,
-        action_size: usize,
-        horizon: usize,
-        dt: f64,
-    ) -> Self {
-        let observation = observation.into_iter().collect();
-        Self { name: name.into(), observation, action_size, horizon, dt, stages: Vec::new() }
-    }
-
-    /// The same with the stages on the way to success, in order.
-    pub fn stages(self, stages: impl IntoIterator<Item = impl Into<String>>) -> Self {
-        Self { stages: stages.into_iter().map(Into::into).collect(), ..self }
-    }
-
-    /// Whether the specification makes sense: every agent asks this before it is built.
-    ///
-    /// # Errors
-    /// [`Error::BadSetting`] names the environment, the feature and the rule: at least one feature, one number in the
-    /// action and one step in the horizon; `dt` positive and finite; names neither empty nor given twice; centres finite,
-    /// scales positive and finite; a [`Role::Difference`] names two features that are no differences themselves.
-    pub fn check(&self) -> Result<()> {
-        let refuse = |problem: String| Err(Error::BadSetting(format!("{}: {problem}", self.name)));
-        if self.observation.is_empty() {
-            return refuse("an observation needs at least one feature".into());
-        }
-        for (name, value) in [("action_size", self.action_size), ("horizon", self.horizon)] {
-            if value == 0 {
-                return refuse(format!("`{name}` must be at least 1"));
-            }
-        }
-        if !(self.dt > 0.0 && self.dt.is_finite()) {
-            return refuse(format!("`dt` must be positive and finite, it is {}", self.dt));
-        }
-        let mut names = std::collections::HashSet::new();
-        for (i, Feature { name, centre, scale, .. }) in self.observation.iter().enumerate() {
-            if name.is_empty() {
-                return refuse(format!("feature {i} has no name"));
-            }
-            if !names.insert(name) {
-                return refuse(format!("two features are called `{name}`"));
-            }
-            if !centre.is_finite() {
-                return refuse(format!("the centre of feature `{name}` must be finite, it is {centre}"));
-            }
-            if !(*scale > 0.0 && scale.is_finite()) {
-                return refuse(format!("the scale of feature `{name}` must be positive and finite, it is {scale}"));
-            }
-        }
-        for Feature { name, role, .. } in &self.observation {
-            let Role::Difference { minuend, subtrahend } = role else { continue };
-            for part in [minuend, subtrahend] {
-                match self.observation.iter().find(|feature| feature.name == *part) {
-                    None => {
-                        return refuse(format!("feature `{name}` is a difference of `{part}`, which is no feature"));
-                    }
-                    Some(Feature { role: Role::Difference { .. }, .. }) => {
-                        return refuse(format!("feature `{name}` is a difference of `{part}`, itself a difference"));
-                    }
-                    Some(_) => {}
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Numbers in an observation.
-    pub fn observation_size(&self) -> usize {
-        self.observation.len()
-    }
-
-    /// Whether `action` can be taken: the right length, and every number finite.
-    ///
-    /// # Errors
-    /// [`Error::BadAction`] names the length or the number that is wrong.
-    pub fn check_action(&self, action: &[f32]) -> Result<()> {
-        if action.len() != self.action_size {
-            return Err(Error::bad_action(
-                &self.name,
-                format!("an action has {} numbers, this one has {}", self.action_size, action.len()),
-            ));
-        }
-        match action.iter().position(|a| !a.is_finite()) {
-            Some(i) => Err(Error::bad_action(&self.name, format!("action[{i}] is {}", action[i]))),
-            None => Ok(()),
-        }
-    }
-}
+use crate::error::Result;
 
 /// The result of one control step, in Gymnasium's terms.
 ///
@@ -341,7 +192,20 @@ impl dyn Env {
     }
 }
 
-/// A reward that can be computed from observations alone, as planners need it.
+/// A reward that can be computed from observations alone, as planners need it that imagine observations.
+///
+/// ```
+/// use handful::prelude::*;
+///
+/// let mut env = Task::Reach.make();
+/// let obs = env.reset(0);
+/// let action = [0.5, 0.0, -0.5, 0.0];
+/// let step = env.step(&action)?;
+/// assert_eq!(env.reward(&obs, &action, &step.observation), step.reward);
+/// # Ok::<(), Error>(())
+/// ```
+#[doc(alias = "reward function")]
+#[doc(alias = "termination function")]
 pub trait KnownReward {
     /// Whether observations determine the reward at all. True by default; false for an environment that can be set to
     /// observe too little, whose [`KnownReward::reward`] then panics.
@@ -352,7 +216,7 @@ pub trait KnownReward {
     /// The reward of reaching `next_obs` from `obs` by `action`.
     fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32;
 
-    /// Whether reaching `next_obs` ends the task itself. Most tasks here never do.
+    /// Whether reaching `next_obs` terminates the episode. False by default: most tasks here end by truncation alone.
     fn terminated(&self, _next_obs: &[f32]) -> bool {
         false
     }
@@ -372,14 +236,28 @@ pub trait KnownReward {
     }
 }
 
-/// A world that can be put back to where it was, and then steps on bit for bit as it did.
+/// An environment whose state can be saved and restored: from a restored state it steps on bit for bit as it did before.
+///
+/// ```
+/// use handful::prelude::*;
+///
+/// let mut env = Task::Push.make();
+/// env.reset(0);
+/// let state = env.snapshot();
+/// let first = env.step(&[1.0, 0.0, 0.0, 0.0])?;
+/// env.restore(&state);
+/// assert_eq!(env.step(&[1.0, 0.0, 0.0, 0.0])?, first);
+/// # Ok::<(), Error>(())
+/// ```
+#[doc(alias = "save state")]
+#[doc(alias = "set_state")]
 pub trait Snapshot {
-    /// All that the future depends on.
+    /// Everything that the rest of an episode depends on.
     type State: Clone + Send + Sync;
 
-    /// The present state.
+    /// The current state.
     fn snapshot(&self) -> Self::State;
 
-    /// Back to a state that [`Snapshot::snapshot`] of this world, or one made alike, has given.
+    /// Goes back to a state that [`Snapshot::snapshot`] of this environment, or of one made alike, has returned.
     fn restore(&mut self, state: &Self::State);
 }

@@ -1,4 +1,19 @@
-//! `pendulum`: swing a pendulum up and hold it. Gymnasium's Pendulum-v1, number for number.
+//! `pendulum`: swing a pendulum up and hold it upright. Gymnasium's Pendulum-v1, number for number.
+//!
+//! ```
+//! use handful::env::pendulum::{Pendulum, PendulumState};
+//! use handful::prelude::*;
+//!
+//! let mut env = Pendulum::default();
+//! let obs = env.reset(3); // cos, sin, angular velocity (rad/s)
+//! let step = env.step(&[1.0])?; // 2 N m
+//! assert!((obs[0].hypot(obs[1]) - 1.0).abs() < 1e-6 && step.reward <= 0.0);
+//!
+//! // Without the environment around it: angle 0 is upright.
+//! let mut state = PendulumState::new(0.0, 0.0);
+//! assert_eq!(state.step(0.0), 0.0);
+//! # Ok::<(), Error>(())
+//! ```
 
 use std::f64::consts::PI;
 
@@ -32,8 +47,8 @@ impl PendulumState {
         Self { angle, speed, elapsed: 0 }
     }
 
-    /// Applies a torque (N m; clipped to 2) for one step of 0.05 s; returns the reward, which
-    /// judges the state *before* the step.
+    /// Applies a torque (N m; clipped to 2) for one step of 0.05 s. Returns the reward, which is that of the state *before*
+    /// the step.
     pub fn step(&mut self, torque: f64) -> f64 {
         let torque = torque.clamp(-MAX_TORQUE, MAX_TORQUE);
         let reward = reward(self.angle, self.speed, torque);
@@ -70,6 +85,7 @@ fn wrapped(angle: f64) -> f64 {
 }
 
 /// The environment: observes (cos, sin, angular velocity); an action is a torque divided by 2 N m.
+#[derive(Clone, Debug)]
 pub struct Pendulum {
     spec: Spec,
     state: PendulumState,
@@ -123,7 +139,7 @@ impl Env for Pendulum {
         Camera { eye: [4.2, 0.6, 1.6], target: [0.0, 0.0, 1.2] }
     }
 
-    /// The tip.
+    /// The pendulum's tip.
     fn position_of(&self, obs: &[f32]) -> Option<[f64; 3]> {
         Some([0.0, -f64::from(obs[1]), 1.2 + f64::from(obs[0])])
     }

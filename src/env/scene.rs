@@ -1,4 +1,13 @@
 //! What an environment looks like: bodies made of primitives and a camera, for the 3D replay.
+//!
+//! ```
+//! use handful::env::arm::Primitive;
+//! use handful::env::scene::Body;
+//!
+//! // A puck of 5 cm in its own frame, and a green ghost of 10 cm for the goal.
+//! let scene = [Body::solid("puck", "#3c6fd8", vec![Primitive::ball(0.05, [0.0; 3])]), Body::goal(0.1)];
+//! assert!(scene[1].goal && scene[0].shapes.len() == 1);
+//! ```
 
 use serde::Serialize;
 
@@ -20,14 +29,15 @@ impl Default for Camera {
     }
 }
 
-/// A body to draw; where it stands comes from [`super::Env::poses`].
+/// A body to draw; its pose comes from [`super::Env::poses`].
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct Body {
     /// Its name. The body called "hand" leaves a trail.
     pub name: String,
     /// Its colour, "#rrggbb".
     pub color: &'static str,
-    /// Whether it marks a goal and is drawn as a ghost.
+    /// Whether it marks a goal and is drawn translucent.
     pub goal: bool,
     /// Its shapes, in its own frame.
     pub shapes: Vec<Primitive>,

@@ -1,4 +1,4 @@
-//! The worlds of this crate by name.
+//! The environments of this crate by name.
 
 use std::sync::Arc;
 
@@ -12,9 +12,10 @@ use super::tabletop::{Lift, Push, Reach, Stack, TableOptions, TableTask, Tableto
 use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::{Error, Result};
 
-/// The tasks of this crate.
+/// The tasks of this crate: each makes an environment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Task {
     /// Bring the hand to a point: [`super::tabletop::Reach`].
     Reach,
@@ -34,7 +35,7 @@ impl Task {
     /// All tasks.
     pub const ALL: [Task; 6] = [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum, Task::Cartpole];
 
-    /// Its name, as the command line has it.
+    /// Its name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Task::Reach => "reach",
@@ -57,21 +58,22 @@ impl Task {
         }
     }
 
-    /// The hand-written policy of an arm task: from a compact observation to an action.
+    /// The hand-written policy of an arm task, from compact observations to actions. None for the others.
     pub fn scripted_policy(self, options: TableOptions) -> Option<impl Fn(&[f32]) -> Vec<f32> + Send + use<>> {
         let task = self.at_table()?;
         Some(move |obs: &[f32]| options.action_of_hand(task.scripted(obs).expect("our tasks have one")))
     }
 
-    /// A world for the task, with default options.
+    /// An environment for the task, with default options.
     pub fn make(self) -> World {
         self.make_with(TableOptions::default()).expect("default options suit every task")
     }
 
-    /// A world for the task.
+    /// An environment for the task.
     ///
     /// # Errors
-    /// If `options` ask of a classic what only the arm can do.
+    /// [`Error::BadSetting`] if pendulum or cart-pole are given options, which only arm tasks have, or if the options do not
+    /// make sense.
     pub fn make_with(self, options: TableOptions) -> Result<World> {
         if let Some(task) = self.at_table() {
             return Ok(Tabletop::with_shared(task, options)?.into());
@@ -101,7 +103,18 @@ impl std::str::FromStr for Task {
     }
 }
 
-/// Any of the worlds of this crate.
+/// Any of the environments of this crate, in one type.
+///
+/// ```
+/// use handful::prelude::*;
+///
+/// let task: Task = "reach".parse()?;
+/// let env = task.make_with(TableOptions { horizon: Some(50), ..TableOptions::default() })?;
+/// assert_eq!((env.spec().name.as_str(), env.spec().horizon), ("reach", 50));
+/// # Ok::<(), Error>(())
+/// ```
+#[derive(Debug)]
+#[non_exhaustive]
 #[allow(clippy::large_enum_variant)] // one of them exists at a time
 pub enum World {
     /// An arm task.
@@ -113,7 +126,7 @@ pub enum World {
 }
 
 impl World {
-    /// The table, if this is an arm task.
+    /// The arm at its table, if this is an arm task.
     pub fn tabletop(&self) -> Option<&Tabletop> {
         match self {
             World::Tabletop(world) => Some(world),
@@ -128,8 +141,9 @@ impl From<Tabletop> for World {
     }
 }
 
-/// A state of any of the worlds.
-#[derive(Clone)]
+/// A state of any of the environments ([`Snapshot`]).
+#[derive(Clone, Debug)]
+#[non_exhaustive]
 pub enum WorldState {
     /// Of an arm task.
     Tabletop(Box<TabletopState>),
@@ -139,7 +153,7 @@ pub enum WorldState {
     CartPole(CartPoleState),
 }
 
-/// The same call on whichever world it is.
+/// Makes the same call on any of the environments.
 macro_rules! delegate {
     ($world:expr, $inner:ident => $call:expr) => {
         match $world {
@@ -210,7 +224,7 @@ impl Snapshot for World {
     }
 
     /// # Panics
-    /// If the state is of another kind of world.
+    /// If the state is one of another kind of environment.
     fn restore(&mut self, state: &WorldState) {
         match (self, state) {
             (World::Tabletop(world), WorldState::Tabletop(state)) => world.restore(state),

@@ -1,15 +1,14 @@
-//! The simplest latent model: an autoencoder whose code moves on by a network. Everything in it is certain: it has no memory
-//! and knows no chance. The step between a model of observations and an [`super::Rssm`].
+//! The simplest latent model: an autoencoder with a network that predicts the next code. It is deterministic, and has no
+//! recurrent state: the step between a model of observations and an [`super::Rssm`].
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
+use super::features::LatentFeatures;
 use super::open_loop::{Episode, OpenLoopModel, actions_from};
-use super::view::LatentFeatures;
 use crate::env::Spec;
-use crate::nn::ops::{self, record};
-use crate::nn::{Adam, Grad, Mlp, Tensor3, device, parameters_of_fields, tensor};
+use crate::nn::{Adam, Grad, Mlp, TapeOps, Tensor3, device, ops, parameters_of_fields, tensor};
 use crate::replay::SequenceBatch;
 use crate::rng::Rng;
 
@@ -17,7 +16,7 @@ use crate::rng::Rng;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AutoencoderConfig {
-    /// Numbers in a code.
+    /// Numbers in a code, the latent state.
     pub code: usize,
     /// Width of each hidden layer of encoder, decoder and dynamics.
     pub hidden: Vec<usize>,
@@ -29,11 +28,11 @@ impl Default for AutoencoderConfig {
     }
 }
 
-/// Encoder, decoder, and the dynamics of codes: `z' = z + f(z, action)`.
+/// Encoder `z = e(x)`, decoder `x = d(z)`, and latent dynamics `z' = z + f(z, action)`.
 #[derive(Clone, Debug)]
 pub struct Autoencoder {
     cpu: Cpu,
-    view: LatentFeatures,
+    obs_features: LatentFeatures,
     encoder: Mlp,
     decoder: Mlp,
     dynamics: Mlp,
@@ -42,61 +41,60 @@ pub struct Autoencoder {
 parameters_of_fields!(Autoencoder: encoder, decoder, dynamics);
 
 impl Autoencoder {
-    /// A new model of a world.
+    /// A new model of environments with this specification.
     pub fn new(spec: &Spec, config: &AutoencoderConfig, rng: &mut Rng) -> Self {
         let cpu = device();
         let AutoencoderConfig { code, hidden } = config;
-        let view = LatentFeatures::new(spec);
+        let obs_features = LatentFeatures::new(spec);
         let mut mlp = |input, output| Mlp::dreamer(&cpu, input, hidden, Some(output), rng);
         Self {
-            encoder: mlp(view.width(), *code),
-            decoder: mlp(*code, view.width()),
-            // At first, nothing moves.
+            encoder: mlp(obs_features.width(), *code),
+            decoder: mlp(*code, obs_features.width()),
+            // At first it predicts that nothing moves.
             dynamics: mlp(code + spec.action_size, *code).scale_output(0.0),
-            view,
+            obs_features,
             cpu,
         }
     }
 
-    /// The codes of observations, in rows: `[1, rows, code]`.
+    /// The codes `[1, rows, code]` of observations `[rows, observation]`.
     pub fn encode(&self, obs: &[f32]) -> Tensor3 {
-        self.encoder.forward(self.view.seen(&self.cpu, obs), Grad::Input)
+        self.encoder.forward(self.obs_features.encode(&self.cpu, obs), Grad::Input)
     }
 
-    /// The observations of codes, in rows.
+    /// The observations `[rows, observation]` of codes `[1, rows, code]`, in physical units.
     pub fn decode(&self, codes: &Tensor3) -> Vec<f32> {
-        self.view.told(&self.decoder.forward(codes.clone(), Grad::Input))
+        self.obs_features.decode(&self.decoder.forward(codes.clone(), Grad::Input))
     }
 
-    /// The codes after `actions` (`[1, rows, actions]`).
+    /// The predicted codes after `actions` (`[1, rows, actions]`).
     pub fn advance<T: Tape<f32, Cpu>>(&self, tape: &mut T, codes: &Tensor3, actions: &Tensor3) -> Tensor3 {
-        let input = record(tape, codes, |codes| ops::join(codes, actions.clone()));
-        let change = record(tape, &input, |input| self.dynamics.forward(input, Grad::Both));
-        record(tape, codes, |codes| codes + change)
+        let input = tape.join(codes, actions);
+        let change = self.dynamics.on(tape, &input, Grad::Both);
+        tape.record(codes, |codes| codes + change)
     }
 
-    /// One step of learning: from the first moment of each stretch the code is led along by the actions, and must tell at
-    /// every moment what was observed there. What lies behind an episode's end is not asked for. Returns the mean squared
-    /// error of a moment, in the networks' units.
+    /// One update: the first observation of each sequence is encoded, the latent dynamics predict all later codes open loop,
+    /// and the loss is the squared error of what the decoder makes of them, up to the end of the episode. Returns the mean
+    /// over time steps, in the networks' units.
     pub fn learn(&mut self, batch: &SequenceBatch, optimiser: &mut Adam) -> f32 {
         let rows = batch.sequences;
         let (width, size) = (batch.actions.len() / (rows * batch.length), batch.obs.len() / (rows * batch.length));
-        let at = |t: usize| self.view.seen(&self.cpu, &batch.obs[t * rows * size..][..rows * size]);
+        let at = |t: usize| self.obs_features.encode(&self.cpu, &batch.obs[t * rows * size..][..rows * size]);
         let mut tape = OwnedTape::default();
-        let mut codes = record(&mut tape, &at(0), |obs| self.encoder.forward(obs, Grad::Params));
+        let mut codes = self.encoder.on(&mut tape, &at(0), Grad::Params);
         let mut counts = vec![1.0; rows];
         let mut losses = Vec::with_capacity(batch.length);
         for t in 0..batch.length {
             if t > 0 {
-                let done = batch.actions[(t - 1) * rows * width..][..rows * width].to_vec();
-                codes = self.advance(&mut tape, &codes, &tensor(&self.cpu, done, (1, rows, width)));
+                let actions = batch.actions[(t - 1) * rows * width..][..rows * width].to_vec();
+                codes = self.advance(&mut tape, &codes, &tensor(&self.cpu, actions, (1, rows, width)));
                 let ended = batch.first[t * rows..][..rows].iter();
                 counts.iter_mut().zip(ended).for_each(|(count, first)| *count *= f32::from(!first));
             }
-            let told = record(&mut tape, &codes, |codes| self.decoder.forward(codes, Grad::Both));
-            let seen = at(t);
-            let loss = record(&mut tape, &told, |told| ops::squared_distance(told, &seen));
-            let loss = record(&mut tape, &loss, |loss| ops::scale_rows(loss, &counts));
+            let decoded = self.decoder.on(&mut tape, &codes, Grad::Both);
+            let loss = tape.squared_distance(&decoded, &at(t));
+            let loss = tape.scale_rows(&loss, &counts);
             losses.push((1.0 / batch.length as f32, loss));
         }
         let loss = ops::total(tape, &losses);
@@ -107,8 +105,8 @@ impl Autoencoder {
 }
 
 impl OpenLoopModel for Autoencoder {
-    fn predicted(&self) -> Vec<(usize, f32)> {
-        self.view.lively()
+    fn predicted_features(&self) -> Vec<(usize, f32)> {
+        self.obs_features.evaluated()
     }
 
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, _rng: &mut Rng) -> Vec<Vec<f32>> {
@@ -118,8 +116,8 @@ impl OpenLoopModel for Autoencoder {
         let mut codes = self.encode(&obs);
         let mut futures = vec![self.decode(&codes)];
         for k in 0..ahead {
-            let done = actions.iter().flat_map(|actions| &actions[k * width..][..width]).copied().collect();
-            codes = self.advance(&mut NoneTape, &codes, &tensor(&self.cpu, done, (1, starts.len(), width)));
+            let taken = actions.iter().flat_map(|actions| &actions[k * width..][..width]).copied().collect();
+            codes = self.advance(&mut NoneTape, &codes, &tensor(&self.cpu, taken, (1, starts.len(), width)));
             futures.push(self.decode(&codes));
         }
         futures

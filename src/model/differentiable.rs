@@ -1,8 +1,8 @@
-//! Gradients of imagined returns with respect to actions, by dfdx's tape through the networks.
+//! Gradients of imagined returns with respect to actions: backpropagation through time through the networks.
 //!
-//! Each member follows its own mean, without chance. A known reward is differentiated by central differences: it
-//! is a cheap function of a few numbers. Cubes are seen upright at the start; their axes keep those names to the end, and are not
-//! straightened on the way.
+//! Each member follows its own mean without noise, as with [`super::Propagation::TsInfMean`]. A known reward is
+//! differentiated by central differences, because it is a cheap function of a few numbers. Cubes are brought into
+//! canonical orientation at the start only; their axes are not orthonormalized on the way.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -11,29 +11,34 @@ use super::{Dynamics, FeatureMap, Reward};
 use crate::env::KnownReward;
 use crate::nn::{Activation, Grad, Mlp, Tensor3, device, ops, tensor, values};
 
-/// Step of the differences of a known reward.
+/// Step of the central differences of a known reward.
 const STEP: f32 = 1e-3;
 
-/// The networks of a [`Dynamics`], on dfdx.
+/// The networks of a [`Dynamics`] as a differentiable simulator.
 ///
-/// What stands around the networks is linear, and so are two more layers: one reads and normalises observation and
-/// action; one adds the predicted changes to the observation, completes it, and hands out the reward if that was learned.
+/// Everything around the networks is linear (but for the tanh features), so it is two more layers without trainable
+/// weights: one selects and normalises features and action; one adds the predicted changes to the observation, recomputes
+/// the differences, and appends the reward if that is learned.
+#[doc(alias = "backpropagation through time")]
+#[doc(alias = "BPTT")]
+#[derive(Clone, Debug)]
 pub struct Differentiable {
     cpu: Cpu,
     entry: Fixed,
-    /// What is read through a tanh: into it, and out of it.
+    /// The tanh features: the layers before and after the tanh.
     near: Option<[Fixed; 2]>,
     networks: Mlp,
     gated: bool,
     exit: Fixed,
-    layout: FeatureMap,
+    features: FeatureMap,
     members: usize,
     observation: usize,
     actions: usize,
     outputs: usize,
 }
 
-/// A layer that does not learn: weight and bias, for each member the same.
+/// A linear layer with fixed weights, the same for each member.
+#[derive(Clone, Debug)]
 struct Fixed {
     weight: Tensor3,
     bias: Tensor3,
@@ -54,37 +59,37 @@ impl Fixed {
 }
 
 impl Differentiable {
-    /// The same networks, to be differentiated.
+    /// The differentiable form of `dynamics`.
     pub fn new(dynamics: &Dynamics) -> Self {
         let cpu = device();
-        let Dynamics { layout, inputs, targets, .. } = dynamics;
-        let (width, actions, outputs) = (layout.width, dynamics.action_size(), dynamics.outputs());
+        let Dynamics { features, inputs, targets, .. } = dynamics;
+        let (width, actions, outputs) = (features.width, dynamics.action_size(), dynamics.outputs());
         let members = dynamics.members();
 
-        // What is read of the observation as it is, what through a tanh, and the action: columns of the networks' input.
-        let (plain, near) = (layout.inputs.len(), layout.near.len());
-        let read = layout.inputs.iter().copied().zip(0..).chain((width..width + actions).zip(plain + near..));
+        // Columns of the networks' input: raw features, tanh features, action.
+        let (raw, near) = (features.raw.len(), features.near.len());
+        let linear = features.raw.iter().copied().zip(0..).chain((width..width + actions).zip(raw + near..));
         let mut entry = vec![vec![0.0; inputs.mean.len()]; width + actions];
-        read.for_each(|(row, column)| entry[row][column] = 1.0 / inputs.scale[column]);
+        linear.for_each(|(row, column)| entry[row][column] = 1.0 / inputs.scale[column]);
         let shift: Vec<f32> = inputs.mean.iter().zip(&inputs.scale).map(|(mean, scale)| -mean / scale).collect();
-        let mut approach = vec![vec![0.0; near]; width + actions];
-        let mut close = vec![vec![0.0; inputs.mean.len()]; near];
-        for (j, (i, factor)) in layout.near.iter().enumerate() {
-            approach[*i][j] = *factor;
-            close[j][plain + j] = 1.0 / inputs.scale[plain + j];
+        let mut before_tanh = vec![vec![0.0; near]; width + actions];
+        let mut after_tanh = vec![vec![0.0; inputs.mean.len()]; near];
+        for (j, (i, factor)) in features.near.iter().enumerate() {
+            before_tanh[*i][j] = *factor;
+            after_tanh[j][raw + j] = 1.0 / inputs.scale[raw + j];
         }
 
-        // From observation and normalised changes to the next observation, and the reward behind it.
-        let rewarded = dynamics.predicts_reward().then_some(width);
-        let columns = width + usize::from(rewarded.is_some());
+        // From observation and normalised changes to the next observation, followed by the reward.
+        let reward = dynamics.predicts_reward().then_some(width);
+        let columns = width + usize::from(reward.is_some());
         let mut exit = vec![vec![0.0; columns]; width + outputs];
         let mut bias = vec![0.0; columns];
         (0..width).for_each(|i| exit[i][i] = 1.0);
-        for (j, i) in layout.predicted.iter().copied().chain(rewarded).enumerate() {
+        for (j, i) in features.predicted.iter().copied().chain(reward).enumerate() {
             exit[width + j][i] = targets.scale[j];
             bias[i] = targets.mean[j];
         }
-        for &[i, a, b] in &layout.differences {
+        for &[i, a, b] in &features.differences {
             exit.iter_mut().for_each(|row| row[i] = row[a] - row[b]);
             bias[i] = bias[a] - bias[b];
         }
@@ -92,12 +97,15 @@ impl Differentiable {
             entry: Fixed::new(&cpu, members, &entry, &shift),
             near: (near > 0).then(|| {
                 let unshifted = vec![0.0; inputs.mean.len()];
-                [Fixed::new(&cpu, members, &approach, &vec![0.0; near]), Fixed::new(&cpu, members, &close, &unshifted)]
+                [
+                    Fixed::new(&cpu, members, &before_tanh, &vec![0.0; near]),
+                    Fixed::new(&cpu, members, &after_tanh, &unshifted),
+                ]
             }),
             networks: dynamics.networks(&cpu),
             gated: dynamics.gated(),
             exit: Fixed::new(&cpu, members, &exit, &bias),
-            layout: layout.clone(),
+            features: features.clone(),
             members,
             observation: width,
             actions,
@@ -106,16 +114,20 @@ impl Differentiable {
         }
     }
 
-    /// What the networks read of observations and actions side by side.
-    fn read<T: Tape<f32, Cpu>>(&self, input: Tensor3<T>) -> Tensor3<T> {
-        let Some([approach, close]) = &self.near else { return self.entry.forward(input) };
+    /// Network inputs of observations and actions side by side.
+    fn inputs<T: Tape<f32, Cpu>>(&self, input: Tensor3<T>) -> Tensor3<T> {
+        let Some([before_tanh, after_tanh]) = &self.near else { return self.entry.forward(input) };
         let (input, tape) = input.split_tape();
-        let (plain, tape) = self.entry.forward(input.clone().put_tape(tape)).split_tape();
-        close.forward(approach.forward(input.put_tape(tape)).tanh()) + plain
+        let (linear, tape) = self.entry.forward(input.clone().put_tape(tape)).split_tape();
+        after_tanh.forward(before_tanh.forward(input.put_tape(tape)).tanh()) + linear
     }
 
-    /// The returns of `actions` (`[candidates, horizon, action]`) from `obs`, and their gradients. A return is the mean
-    /// over the members' returns less `disagreement_penalty` times their standard deviation.
+    /// Returns of the action sequences `actions` (`[candidates, horizon, action]`) from `obs`, `[candidates]`, and their
+    /// gradients with respect to `actions`, of the same shape. A return is the mean over the members' undiscounted returns
+    /// minus `disagreement_penalty` times their standard deviation.
+    ///
+    /// # Panics
+    /// If the sizes do not fit together, or `reward` is [`Reward::Learned`] and the model has not learned rewards.
     pub fn gradients(
         &self,
         reward: Reward,
@@ -126,7 +138,7 @@ impl Differentiable {
     ) -> (Vec<f32>, Vec<f32>) {
         let (members, width) = (self.members, self.actions);
         let candidates = actions.len() / (horizon * width);
-        // Each step's actions once for each member, so that each member's share of the gradient arrives by itself.
+        // Actions are repeated for each member, so that their gradients arrive member by member.
         let step_actions: Vec<Tensor3> = (0..horizon)
             .map(|t| {
                 let of_step = actions.chunks_exact(horizon * width).flat_map(|row| &row[t * width..][..width]);
@@ -135,31 +147,32 @@ impl Differentiable {
             })
             .collect();
         let mut obs = obs.to_vec();
-        self.layout.canonicalize(&mut obs, None);
+        self.features.canonicalize(&mut obs, None);
         let start = tensor(&self.cpu, obs.repeat(members * candidates), (members, candidates, self.observation));
         let (mut state, mut tape) = start.leaky_traced().split_tape();
         let mut rewards: Vec<Tensor3> = Vec::with_capacity(horizon);
         for action in &step_actions {
             let input = ops::join(state.clone().put_tape(tape), action.clone());
-            let head = self.networks.forward(self.read(input), Grad::Input);
+            let head = self.networks.forward(self.inputs(input), Grad::Input);
             let head = if self.gated { ops::gated(head) } else { head };
             let changes = head.slice((.., .., ..self.outputs));
-            let (changes, so_far) = changes.split_tape();
-            let (after, so_far) = self.exit.forward(ops::join(state.clone().put_tape(so_far), changes)).split_tape();
-            let (next, so_far) = after.clone().put_tape(so_far).slice((.., .., ..self.observation)).split_tape();
+            let (changes, recorded) = changes.split_tape();
+            let (after, recorded) =
+                self.exit.forward(ops::join(state.clone().put_tape(recorded), changes)).split_tape();
+            let (next, recorded) = after.clone().put_tape(recorded).slice((.., .., ..self.observation)).split_tape();
             let reward_of_step = match reward {
-                Reward::Learned => after.put_tape(so_far).slice((.., .., self.observation..)),
-                Reward::Known(known) => known_reward(known, &state, action, next.clone().put_tape(so_far)),
+                Reward::Learned => after.put_tape(recorded).slice((.., .., self.observation..)),
+                Reward::Known(known) => known_reward(known, &state, action, next.clone().put_tape(recorded)),
             };
-            let (reward_of_step, so_far) = reward_of_step.split_tape();
-            let next = next.put_tape(so_far);
+            let (reward_of_step, recorded) = reward_of_step.split_tape();
+            let next = next.put_tape(recorded);
             rewards.push(reward_of_step);
             (state, tape) = next.split_tape();
         }
         let mut rewards = rewards.into_iter();
         let first = rewards.next().expect("at least one step").put_tape(tape);
         let total = rewards.fold(first, |total, reward| total + reward);
-        let (returns, weights) = weigh(values(&total), members, disagreement_penalty);
+        let (returns, weights) = mean_minus_std(values(&total), members, disagreement_penalty);
         let weights = tensor(&self.cpu, weights, (members, candidates, 1));
         let mut gradients = (total * weights).sum::<Rank0, _>().backward();
         let mut slopes = vec![0.0; actions.len()];
@@ -174,9 +187,9 @@ impl Differentiable {
     }
 }
 
-/// Mean less `disagreement_penalty` deviations over the members (`returns` is `[members, candidates]`), and how it changes with each
-/// member's return.
-fn weigh(returns: &[f32], members: usize, disagreement_penalty: f32) -> (Vec<f32>, Vec<f32>) {
+/// Mean minus `disagreement_penalty` standard deviations over the members (`returns` is `[members, candidates]`), and the
+/// derivatives with respect to each member's return.
+fn mean_minus_std(returns: &[f32], members: usize, disagreement_penalty: f32) -> (Vec<f32>, Vec<f32>) {
     let candidates = returns.len() / members;
     let n = members as f32;
     let mut scores = vec![0.0; candidates];
@@ -184,16 +197,16 @@ fn weigh(returns: &[f32], members: usize, disagreement_penalty: f32) -> (Vec<f32
     for c in 0..candidates {
         let own = || (0..members).map(|m| returns[m * candidates + c]);
         let mean = own().sum::<f32>() / n;
-        let deviation = (own().map(|r| (r - mean).powi(2)).sum::<f32>() / n).sqrt();
-        scores[c] = mean - disagreement_penalty * deviation;
+        let std = (own().map(|r| (r - mean).powi(2)).sum::<f32>() / n).sqrt();
+        scores[c] = mean - disagreement_penalty * std;
         for (m, r) in own().enumerate() {
-            weights[m * candidates + c] = (1.0 - disagreement_penalty * (r - mean) / deviation.max(1e-6)) / n;
+            weights[m * candidates + c] = (1.0 - disagreement_penalty * (r - mean) / std.max(1e-6)) / n;
         }
     }
     (scores, weights)
 }
 
-/// The known reward of steps, `[members, candidates, 1]`.
+/// The known reward of a time step, `[members, candidates, 1]`.
 fn known_reward<T: Tape<f32, Cpu>>(
     known: &(dyn KnownReward + Sync),
     obs: &Tensor3,
@@ -206,18 +219,18 @@ fn known_reward<T: Tape<f32, Cpu>>(
     let rows =
         || values(obs).chunks_exact(width).zip(values(action).chunks_exact(act)).zip(values(&next).chunks_exact(width));
     let rewards = rows().map(|((obs, action), next)| known.reward(obs, action, next)).collect();
-    // How the reward changes with each number that it is computed from, side by side.
+    // Derivatives of the reward with respect to observation, action and next observation, side by side.
     let slopes: Vec<f32> = if T::OWNS_TAPE {
         rows().flat_map(|((obs, action), next)| slopes_of(known, [obs, action, next])).collect()
     } else {
         Vec::new()
     };
-    let rewarded = obs.device().tensor_from_vec(rewards, (members, candidates, 1));
+    let reward = obs.device().tensor_from_vec(rewards, (members, candidates, 1));
     if T::OWNS_TAPE {
         let parts = [obs.clone(), action.clone(), next];
-        let rewarded = rewarded.clone();
+        let reward = reward.clone();
         tape.add_backward_op(move |gradients| {
-            let d = ops::take(gradients, &rewarded)?;
+            let d = ops::take(gradients, &reward)?;
             let whole = 2 * width + act;
             let mut from = 0;
             for part in &parts {
@@ -231,9 +244,10 @@ fn known_reward<T: Tape<f32, Cpu>>(
             Ok(())
         });
     }
-    rewarded.put_tape(tape)
+    reward.put_tape(tape)
 }
 
+/// Central differences of a reward with respect to its three arguments, side by side.
 fn slopes_of(known: &(dyn KnownReward + Sync), parts: [&[f32]; 3]) -> Vec<f32> {
     let mut parts = parts.map(<[f32]>::to_vec);
     let mut slopes = Vec::with_capacity(parts.iter().map(Vec::len).sum());

@@ -1,30 +1,62 @@
-//! What was learned of the world: models that predict what comes next, and say how sure they are.
+//! Learned models of the environment: what comes next, and how uncertain that is.
 //!
-//! [`Ensemble`] learns; its snapshot [`Dynamics`] predicts; [`Imagination`] lets a snapshot run ahead along many action
-//! sequences at once. [`uncertainty`] and [`calibration`] tell what the predictions are worth.
+//! | model | predicts | paper |
+//! | --- | --- | --- |
+//! | [`Ensemble`] | the next observation, as a Gaussian per member | PETS (Chua et al. 2018) |
+//! | [`Autoencoder`] | the next code of an observation, deterministically | |
+//! | [`WorldModel`] | the next latent state, from a history of observations | PlaNet, Dreamer (Hafner et al. 2019, 2023) |
+//!
+//! An [`Ensemble`] is trained; its snapshot [`Dynamics`] predicts; [`Imagination`] rolls a snapshot out along many action
+//! sequences at once. [`uncertainty`] separates epistemic from aleatoric uncertainty, [`calibration`] and [`open_loop`]
+//! measure how good predictions are.
+//!
+//! ```
+//! use handful::model::{Ensemble, EnsembleConfig};
+//! use handful::prelude::*;
+//! use handful::rng;
+//!
+//! // Random transitions of a pendulum.
+//! let mut world = Task::Pendulum.make();
+//! let mut rng = rng::stream(0, "example");
+//! let mut replay = ReplayBuffer::new(world.spec().observation_size(), world.spec().action_size, 1000);
+//! let mut obs = world.reset(0);
+//! for _ in 0..200 {
+//!     let action = vec![rng::uniform(&mut rng, -1.0, 1.0) as f32];
+//!     let Step { observation: next_obs, reward, terminated, truncated, .. } = world.step(&action)?;
+//!     let transition = Transition { obs, action, reward, next_obs: next_obs.clone(), terminated, truncated };
+//!     replay.push(&transition);
+//!     obs = next_obs;
+//! }
+//!
+//! let config = EnsembleConfig { hidden: vec![16], first_steps: 100, ..EnsembleConfig::default() };
+//! let mut ensemble = Ensemble::new(world.spec(), config, &mut rng)?;
+//! ensemble.fit(&replay, &mut rng);
+//! let prediction = ensemble.dynamics().predict(&obs, &[0.5]);
+//! for (i, mean) in prediction.mean.iter().enumerate() {
+//!     let std = (prediction.aleatoric[i] + prediction.epistemic[i]).sqrt();
+//!     println!("{}: {mean:.3} ± {std:.3}", world.spec().observation[i].name);
+//! }
+//! # assert_eq!(prediction.mean.len(), world.spec().observation_size());
+//! # Ok::<(), handful::error::Error>(())
+//! ```
 
 mod autoencoder;
 pub mod calibration;
-mod cube;
 mod differentiable;
 mod dynamics;
-mod ensemble;
-mod imagination;
-mod layout;
-mod normaliser;
+pub mod ensemble;
+pub mod features;
+pub mod imagination;
 pub mod open_loop;
 pub mod rssm;
 pub mod uncertainty;
-mod view;
 mod world_model;
 
 pub use autoencoder::{Autoencoder, AutoencoderConfig};
-pub use cube::Cube;
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit};
+pub use features::{Cube, FeatureMap, LatentFeatures, Normaliser};
 pub use imagination::{Imagination, ImaginedReturns, Propagation, Reward, Value};
-pub use layout::FeatureMap;
-pub use normaliser::Normaliser;
 pub use rssm::{Latent, Rssm, RssmConfig};
 pub use world_model::{WorldModel, WorldModelConfig, WorldModelLoss};

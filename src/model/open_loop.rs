@@ -1,4 +1,34 @@
-//! How well a model foresees several steps: the actions of real episodes are replayed in it, from many starts.
+//! Open-loop evaluation: how far predictions over several time steps, without observations in between, are from what
+//! happened. The actions of recorded episodes are replayed in the model, from many start times.
+//!
+//! ```
+//! use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
+//! use handful::rng::{self, Rng};
+//!
+//! /// Predicts that nothing ever changes.
+//! struct Persistence;
+//!
+//! impl OpenLoopModel for Persistence {
+//!     fn predicted_features(&self) -> Vec<(usize, f32)> {
+//!         vec![(0, 1.0)]
+//!     }
+//!
+//!     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, _rng: &mut Rng) -> Vec<Vec<f32>> {
+//!         let now = starts.iter().flat_map(|(episode, t)| episode.observations[*t].clone()).collect();
+//!         vec![now; horizon + 1]
+//!     }
+//! }
+//!
+//! let episode = Episode {
+//!     observations: (0..=40).map(|t| vec![(0.3 * t as f32).sin()]).collect(),
+//!     actions: vec![vec![0.0]; 40],
+//!     ..Episode::default()
+//! };
+//! let rows = open_loop(&Persistence, &[episode], &mut rng::stream(0, "example"));
+//! assert_eq!(rows.iter().map(|row| row.horizon).collect::<Vec<_>>(), [1, 2, 5, 10, 15, 25]);
+//! // The unit of the error is the standard deviation of the change.
+//! assert!(rows.iter().all(|row| (0.5..2.0).contains(&row.rmse)));
+//! ```
 
 use rand::seq::IndexedRandom;
 use serde::{Deserialize, Serialize};
@@ -9,131 +39,138 @@ use crate::env::KnownReward;
 pub use crate::replay::Episode;
 use crate::rng::Rng;
 
-/// How far ahead models are judged, in steps.
+/// Numbers of time steps over which predictions are evaluated.
 pub const HORIZONS: [usize; 6] = [1, 2, 5, 10, 15, 25];
 
-/// EvalSeeds from which a model is judged.
+/// Start times, drawn from all episodes.
 const STARTS: usize = 200;
-/// ImaginedReturns for each member and start.
+/// Particles for each member and start time.
 const PARTICLES_PER_MEMBER: usize = 4;
-/// Numbers whose displacement varies less than this share of its typical step are not judged: they stand still.
-const STILL: f64 = 1e-3;
+/// Features whose displacement has a standard deviation below this fraction of their typical change per time step are left
+/// out: they are constant in these episodes.
+const MIN_DISPLACEMENT: f64 = 1e-3;
 
-/// How well a model foresees a number of steps.
+/// The quality of a model's predictions over a number of time steps.
+#[doc(alias = "open-loop evaluation")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OpenLoop {
-    /// Steps ahead.
+    /// Time steps ahead.
     pub horizon: usize,
-    /// Error of the expected observation: the root mean square over the predicted numbers, each in units of the standard
-    /// deviation of its displacement over so many steps; the median over starts. One who foresees no change has about 1.
+    /// Error of the predicted mean: root mean square over the predicted features, each in units of the standard deviation of
+    /// its displacement over `horizon` time steps; median over start times. Predicting no change has an error of about 1.
+    #[doc(alias = "RMSE")]
     pub rmse: f64,
-    /// Mean negative log-likelihood of one number in those units.
+    /// Negative log-likelihood in nats, mean over features (in those units) and start times. The predicted distribution is a
+    /// Gaussian with mean and variance of the particles.
     pub nll: f64,
-    /// Share of numbers inside the interval that should hold 90 % of them.
+    /// Coverage of the 90 % prediction interval, a fraction.
     pub coverage90: f64,
-    /// The error that a tenth of the starts exceed.
+    /// 90th percentile over start times of the error whose median is `rmse`.
     pub rmse_p90: f64,
 }
 
-/// Something that foresees what comes of actions.
+/// A model that predicts several time steps ahead from actions alone.
 pub trait OpenLoopModel {
-    /// The numbers of an observation that it foresees, and by how much each typically changes in a step.
-    fn predicted(&self) -> Vec<(usize, f32)>;
+    /// Index of each feature that counts in the evaluation, with its typical change per time step.
+    fn predicted_features(&self) -> Vec<(usize, f32)>;
 
-    /// What may be observed after each of 0 to `ahead` steps, if from each start its episode's actions are repeated:
-    /// `[particles, starts, observation]` each. Of an episode it may look at all up to its start.
-    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
+    /// Predicted observations after 0 to `horizon` time steps of each start's recorded actions: `horizon + 1` arrays
+    /// `[particles, starts, observation]`. A start is an episode and a time step in it; the model may read observations up
+    /// to that time step as context, not later ones.
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
 }
 
-/// Judges a model on episodes that it has not learned from. Horizons longer than the episodes are left out.
+/// Evaluates a model on held-out episodes, one row for each of the [`HORIZONS`] that is no longer than the longest
+/// episode; no rows without episodes.
 pub fn open_loop(model: &impl OpenLoopModel, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
     let longest = episodes.iter().map(|episode| episode.actions.len()).max().unwrap_or(0);
     let horizons: Vec<usize> = HORIZONS.into_iter().filter(|k| *k <= longest).collect();
-    let Some(&ahead) = horizons.last() else { return Vec::new() };
+    let Some(&furthest) = horizons.last() else { return Vec::new() };
     let all: Vec<(&Episode, usize)> = episodes
         .iter()
-        .flat_map(|episode| (0..(episode.actions.len() + 1).saturating_sub(ahead)).map(move |t| (episode, t)))
+        .flat_map(|episode| (0..(episode.actions.len() + 1).saturating_sub(furthest)).map(move |t| (episode, t)))
         .collect();
     let starts: Vec<(&Episode, usize)> = all.sample(rng, STARTS).copied().collect();
-    let futures = model.open_loop_predictions(&starts, ahead, rng);
-    let foreseen = model.predicted();
-    horizons.into_iter().map(|k| judge(&foreseen, &starts, &futures[k], k)).collect()
+    let predictions = model.open_loop_predictions(&starts, furthest, rng);
+    let features = model.predicted_features();
+    horizons.into_iter().map(|k| evaluate(&features, &starts, &predictions[k], k)).collect()
 }
 
-/// The actions that follow a start.
-pub(crate) fn actions_from<'a>((episode, t): (&'a Episode, usize), ahead: usize) -> impl Iterator<Item = f32> + 'a {
-    episode.actions[t..t + ahead].iter().flatten().copied()
+/// The recorded actions of `horizon` time steps from a start, one after the other.
+pub(crate) fn actions_from<'a>((episode, t): (&'a Episode, usize), horizon: usize) -> impl Iterator<Item = f32> + 'a {
+    episode.actions[t..t + horizon].iter().flatten().copied()
 }
 
 impl OpenLoopModel for Dynamics {
-    fn predicted(&self) -> Vec<(usize, f32)> {
+    fn predicted_features(&self) -> Vec<(usize, f32)> {
         self.typical_changes().collect()
     }
 
-    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
         let obs: Vec<f32> = starts.iter().flat_map(|(episode, t)| episode.observations[*t].iter().copied()).collect();
-        let actions: Vec<f32> = starts.iter().flat_map(|start| actions_from(*start, ahead)).collect();
+        let actions: Vec<f32> = starts.iter().flat_map(|start| actions_from(*start, horizon)).collect();
         let imagination = Imagination {
             dynamics: self,
-            reward: Reward::Known(&Indifferent),
+            reward: Reward::Known(&ZeroReward),
             propagation: Propagation::TsInf,
             particles: PARTICLES_PER_MEMBER * self.members(),
             value: None,
         };
-        imagination.trajectories(&obs, &actions, ahead, rng).0
+        imagination.trajectories(&obs, &actions, horizon, rng).0
     }
 }
 
-/// Judges the states after `k` steps, `[particles, starts, observation]`.
-fn judge(foreseen: &[(usize, f32)], starts: &[(&Episode, usize)], states: &[f32], k: usize) -> OpenLoop {
+/// Compares predictions over `k` time steps, `[particles, starts, observation]`, with the episodes.
+fn evaluate(features: &[(usize, f32)], starts: &[(&Episode, usize)], predictions: &[f32], k: usize) -> OpenLoop {
     let width = starts[0].0.observations[0].len();
-    // What follows from other numbers is not judged twice.
     let mut squares = vec![0.0; starts.len()];
-    let mut numbers = 0;
-    let mut judged = Vec::new();
+    let mut compared = 0;
+    let mut forecasts = Vec::new();
     let mut log_units = 0.0;
-    for &(i, typical) in foreseen {
+    for &(i, typical) in features {
         let displacement = |(episode, t): &(&Episode, usize)| {
             f64::from(episode.observations[t + k][i]) - f64::from(episode.observations[*t][i])
         };
-        let unit = deviation(starts.iter().map(displacement));
-        if unit < STILL * f64::from(typical) {
+        let unit = std(starts.iter().map(displacement));
+        if unit < MIN_DISPLACEMENT * f64::from(typical) {
             continue;
         }
-        numbers += 1;
+        compared += 1;
         for (s, (episode, t)) in starts.iter().enumerate() {
-            let particles = states.chunks_exact(width).skip(s).step_by(starts.len()).map(|state| f64::from(state[i]));
-            let count = states.len() / width / starts.len();
+            let particles =
+                predictions.chunks_exact(width).skip(s).step_by(starts.len()).map(|state| f64::from(state[i]));
+            let count = predictions.len() / width / starts.len();
             let mean = particles.clone().sum::<f64>() / count as f64;
             let outcome = f64::from(episode.observations[t + k][i]);
             squares[s] += ((mean - outcome) / unit).powi(2);
-            judged.push(GaussianForecast { mean, deviation: deviation(particles).max(1e-9), outcome });
+            forecasts.push(GaussianForecast { mean, std: std(particles).max(1e-9), outcome });
             log_units += unit.ln();
         }
     }
-    let mut errors: Vec<f64> = squares.iter().map(|square| (square / f64::from(numbers.max(1))).sqrt()).collect();
+    let mut errors: Vec<f64> = squares.iter().map(|square| (square / f64::from(compared.max(1))).sqrt()).collect();
     errors.sort_by(f64::total_cmp);
     let quantile = |q: f64| errors[(q * (errors.len() - 1) as f64).round() as usize];
-    let count = judged.len().max(1) as f64;
+    let count = forecasts.len().max(1) as f64;
     OpenLoop {
         horizon: k,
         rmse: quantile(0.5),
-        nll: (judged.iter().map(GaussianForecast::nll).sum::<f64>() - log_units) / count,
-        coverage90: coverage(&judged, 0.9),
+        nll: (forecasts.iter().map(GaussianForecast::nll).sum::<f64>() - log_units) / count,
+        coverage90: coverage(&forecasts, 0.9),
         rmse_p90: quantile(0.9),
     }
 }
 
-fn deviation(values: impl Iterator<Item = f64> + Clone) -> f64 {
+/// Population standard deviation.
+fn std(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let n = values.clone().count() as f64;
     let mean = values.clone().sum::<f64>() / n;
     (values.map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt()
 }
 
 /// Rewards do not matter here.
-struct Indifferent;
+struct ZeroReward;
 
-impl KnownReward for Indifferent {
+impl KnownReward for ZeroReward {
     fn reward(&self, _obs: &[f32], _action: &[f32], _next_obs: &[f32]) -> f32 {
         0.0
     }

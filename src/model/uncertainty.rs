@@ -1,12 +1,35 @@
-//! What an ensemble is unsure of, and why; and what to make of uncertain returns.
+//! Measures of an ensemble's uncertainty, and risk measures of uncertain returns.
+//!
+//! *Aleatoric* uncertainty is noise of the environment, which each member predicts as a variance; more data do not reduce
+//! it. *Epistemic* uncertainty is lack of data, which shows as disagreement of the members' means.
+//!
+//! ```
+//! use handful::model::uncertainty::{Risk, split};
+//!
+//! // Two members, one feature: they agree about the noise, and disagree about the mean.
+//! let (means, variances) = (vec![vec![1.0], vec![3.0]], vec![vec![0.5], vec![0.5]]);
+//! let [mean, aleatoric, epistemic] = split(&means, &variances);
+//! assert_eq!((mean[0], aleatoric[0], epistemic[0]), (2.0, 0.5, 1.0));
+//!
+//! // A gamble: 10 on average, but one particle in five is a disaster.
+//! let returns = [20.0, 20.0, 20.0, 20.0, -30.0];
+//! assert_eq!(Risk::Neutral.of(&returns), 10.0);
+//! assert_eq!(Risk::Cvar(0.2).of(&returns), -30.0);
+//! ```
 
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
-/// Splits what the members of an ensemble say (means and variances, `[members][features]`) into mean, aleatoric
-/// variance (the mean of the variances: chance) and epistemic variance (the variance of the means: ignorance).
-/// Their sum is the variance of the mixture.
+/// Decomposes the members' predictions (means and variances, `[members][features]`) into mean, aleatoric variance (the mean
+/// of the variances) and epistemic variance (the variance of the means), `[features]` each. The sum of the two is the
+/// variance of the mixture (law of total variance).
+///
+/// # Panics
+/// If there are no members.
+#[doc(alias = "law of total variance")]
+#[doc(alias = "aleatoric")]
+#[doc(alias = "epistemic")]
 pub fn split(means: &[Vec<f64>], variances: &[Vec<f64>]) -> [Vec<f64>; 3] {
     let mean = mean_of(means);
     let squares: Vec<Vec<f64>> =
@@ -20,20 +43,26 @@ fn mean_of(rows: &[Vec<f64>]) -> Vec<f64> {
     (0..rows[0].len()).map(|i| rows.iter().map(|row| row[i]).sum::<f64>() / n).collect()
 }
 
-/// The largest distance between two members' means (MOReL, Kidambi et al. 2020).
+/// Largest Euclidean distance between two members' means, `[members][features]`: the disagreement of MOReL (Kidambi et al.
+/// 2020).
+#[doc(alias = "MOReL")]
+#[doc(alias = "disagreement")]
 pub fn max_pairwise_distance(means: &[Vec<f64>]) -> f64 {
     let distance = |a: &Vec<f64>, b: &Vec<f64>| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
     means.iter().flat_map(|a| means.iter().map(move |b| distance(a, b))).fold(0.0, f64::max)
 }
 
-/// The largest norm of a member's deviations (the penalty of MOPO, Yu et al. 2020): mostly chance, and yet large where
-/// data are few.
-pub fn max_deviation(variances: &[Vec<f64>]) -> f64 {
+/// Largest Euclidean norm of a member's standard deviations (variances are `[members][features]`): the uncertainty penalty
+/// of MOPO (Yu et al. 2020). Mostly aleatoric, and yet large where data are few.
+#[doc(alias = "MOPO")]
+pub fn max_std_norm(variances: &[Vec<f64>]) -> f64 {
     variances.iter().map(|v| v.iter().sum::<f64>().sqrt()).fold(0.0, f64::max)
 }
 
-/// The Jensen-Renyi divergence of order 2 of an ensemble of diagonal Gaussians (MAX, Shyam et al. 2019): the entropy of
-/// the mixture less the members' mean entropy. Zero if all agree.
+/// Jensen-Rényi divergence of order 2 of an ensemble of diagonal Gaussians (MAX, Shyam et al. 2019), in nats: the Rényi
+/// entropy of the mixture minus the mean of the members' entropies. Zero if all members agree. Means and variances are
+/// `[members][features]`.
+#[doc(alias = "Jensen-Renyi")]
 pub fn jensen_renyi(means: &[Vec<f64>], variances: &[Vec<f64>]) -> f64 {
     let members = means.len();
     // Entropy of the mixture: -ln of the mean overlap of two members; sums of logarithms, because overlaps underflow.
@@ -49,8 +78,10 @@ pub fn jensen_renyi(means: &[Vec<f64>], variances: &[Vec<f64>]) -> f64 {
     mixture - variances.iter().map(entropy).sum::<f64>() / members as f64
 }
 
-/// An upper bound of the information that the outcome would give about which member is right: half the sum of
-/// ln(total variance) less the mean of ln(variance).
+/// Upper bound of the mutual information between outcome and member, in nats: `1/2 sum (ln(total variance) - mean of
+/// ln(variance))` over features, which takes the mixture's entropy to be that of a Gaussian with the same variance. Means
+/// and variances are `[members][features]`.
+#[doc(alias = "information gain")]
 pub fn mutual_information(means: &[Vec<f64>], variances: &[Vec<f64>]) -> f64 {
     let [_, aleatoric, epistemic] = split(means, variances);
     let total = aleatoric.iter().zip(&epistemic).map(|(a, e)| (a + e).ln());
@@ -59,33 +90,41 @@ pub fn mutual_information(means: &[Vec<f64>], variances: &[Vec<f64>]) -> f64 {
     0.5 * total.zip(own).map(|(total, own)| total - own).sum::<f64>()
 }
 
-/// What to make of the returns of several possible futures.
+/// Risk measures: one score for the returns of a candidate's particles.
+#[doc(alias = "risk-averse")]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Risk {
-    /// Their mean.
+    /// The mean.
     #[default]
     Neutral,
-    /// Mean minus so many standard deviations; a negative number seeks risk.
-    Deviation(f32),
-    /// The mean of the worst share.
+    /// The mean minus this many standard deviations; negative is risk-seeking.
+    #[doc(alias = "mean-variance")]
+    #[serde(rename = "mean-std", alias = "deviation")]
+    MeanStd(f32),
+    /// Conditional value at risk: the mean of the worst fraction (at least one particle) of the returns.
+    #[doc(alias = "CVaR")]
+    #[doc(alias = "conditional value at risk")]
+    #[doc(alias = "expected shortfall")]
+    #[serde(alias = "worst")]
     Cvar(f32),
-    /// `-ln(mean(exp(-theta r))) / theta`: the larger theta, the more the worst counts.
+    /// Entropic risk `-ln(mean(exp(-theta r))) / theta`: the larger theta, the more the worst returns count.
+    #[doc(alias = "exponential utility")]
     Entropic(f32),
 }
 
 impl Risk {
-    /// One number for the returns of several futures.
+    /// The score of these returns.
     pub fn of(self, returns: &[f32]) -> f32 {
         let n = returns.len() as f32;
         let mean = returns.iter().sum::<f32>() / n;
         match self {
             Risk::Neutral => mean,
-            Risk::Deviation(weight) => {
+            Risk::MeanStd(weight) => {
                 mean - weight * (returns.iter().map(|r| (r - mean).powi(2)).sum::<f32>() / n).sqrt()
             }
-            Risk::Cvar(share) => {
-                let count = ((share * n).ceil() as usize).clamp(1, returns.len());
+            Risk::Cvar(fraction) => {
+                let count = ((fraction * n).ceil() as usize).clamp(1, returns.len());
                 let mut sorted = returns.to_vec();
                 sorted.sort_by(f32::total_cmp);
                 sorted[..count].iter().sum::<f32>() / count as f32
@@ -123,19 +162,19 @@ mod tests {
             found.iter().zip(expected).for_each(|(found, expected)| near(*found, expected));
         }
         near(max_pairwise_distance(&means), 0.335_410_20);
-        near(max_deviation(&variances), 0.360_555_13);
+        near(max_std_norm(&variances), 0.360_555_13);
         near(jensen_renyi(&means, &variances), 0.147_265_01);
         near(mutual_information(&means, &variances), 0.161_468_63);
     }
 
     #[test]
-    fn members_that_agree_are_not_unsure() {
+    fn members_that_agree_have_no_epistemic_uncertainty() {
         let (means, variances) = (vec![vec![0.3, 0.1]; 4], vec![vec![0.2, 0.5]; 4]);
         near(jensen_renyi(&means, &variances), 0.0);
         near(mutual_information(&means, &variances), 0.0);
-        // Far apart in a hundred dimensions, where a product of densities underflows.
-        let apart = [vec![0.0; 100], vec![100.0; 100]];
-        let found = jensen_renyi(&apart, &vec![vec![1e-4; 100]; 2]);
+        // Distant means in a hundred dimensions, where a product of densities underflows.
+        let distant = [vec![0.0; 100], vec![100.0; 100]];
+        let found = jensen_renyi(&distant, &vec![vec![1e-4; 100]; 2]);
         near(found, 2.0_f64.ln());
     }
 
@@ -144,7 +183,7 @@ mod tests {
         let returns = [10.0, 12.0, 8.0, 11.0, 9.0, -5.0, 10.5, 9.5, 11.5, 10.0];
         for (risk, expected) in [
             (Risk::Neutral, 8.65),
-            (Risk::Deviation(0.5), 6.307_325),
+            (Risk::MeanStd(0.5), 6.307_325),
             (Risk::Cvar(0.2), 1.5),
             (Risk::Entropic(0.5), -0.405_725_28),
         ] {

@@ -1,7 +1,8 @@
-//! Adam (Kingma & Ba 2015), with clipping and decoupled weight decay; and LaProp (Ziyin et al. 2020), which is Adam in
-//! another order.
+//! Adam (Kingma & Ba 2015, Algorithm 1), with gradient clipping and decoupled weight decay (AdamW); and LaProp (Ziyin et
+//! al. 2020, Algorithm 1), which normalises the gradient before it enters the first moment.
 
 use std::collections::BTreeMap;
+use std::ops::{AddAssign, Mul, Sub};
 
 use dfdx::tensor::{Cpu, Gradients};
 use rayon::prelude::*;
@@ -16,21 +17,25 @@ use crate::error::Result;
 pub struct AdamConfig {
     /// Step size.
     pub learning_rate: f32,
-    /// Decay of the two moment estimates.
+    /// Decay rates of the two moment estimates, beta1 and beta2.
     pub betas: [f32; 2],
-    /// Added to the root of the second moment.
+    /// Added to the root of the second moment, in the denominator of a step.
     pub epsilon: f32,
     /// Gradients with a larger norm, over all parameters together, are scaled down to it.
     pub max_norm: Option<f32>,
-    /// Share of itself that a weight loses in a step of size one, whatever its gradient (AdamW, Loshchilov & Hutter
-    /// 2019). Biases and other parameters do not.
+    /// Decoupled weight decay (AdamW, Loshchilov & Hutter 2019): in a step, a weight loses `learning_rate` times this
+    /// share of itself, whatever its gradient. Biases and other parameters do not decay.
+    #[doc(alias = "AdamW")]
     pub weight_decay: f32,
-    /// Gradients are divided by the root of their second moment before they enter the first one, instead of after: LaProp.
+    /// LaProp: gradients are divided by the root of their second moment before they enter the first moment; Adam divides
+    /// the first moment instead.
+    #[doc(alias = "LaProp")]
     pub normalise_first: bool,
-    /// The gradient of each parameter is scaled down to this share of the parameter's norm, which counts as 1e-3 at least
-    /// (adaptive gradient clipping: Brock et al. 2021, by whole tensors as in DreamerV3).
+    /// Adaptive gradient clipping (AGC; Brock et al. 2021, for whole tensors as in DreamerV3): a gradient with a norm larger
+    /// than this share of its parameter's norm (1e-3 at least) is scaled down to it.
+    #[doc(alias = "AGC")]
     pub adaptive_clip: Option<f32>,
-    /// Steps over which the step size grows to what it will be.
+    /// Steps over which the step size grows linearly from zero to `learning_rate`.
     pub warm_up: u32,
 }
 
@@ -61,7 +66,28 @@ impl AdamConfig {
     }
 }
 
-/// The optimiser's state for one set of parameters.
+/// The Adam optimiser, with its state for one module's parameters.
+///
+/// ```
+/// use handful::nn::dfdx::prelude::*;
+/// use handful::nn::{Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, device, tensor};
+/// use handful::rng;
+///
+/// let cpu = device();
+/// let (activation, init) = (Activation::Silu, Init::Uniform);
+/// let config = MlpConfig { members: 1, input: 1, hidden: vec![8], output: Some(1), norm: Norm::None, activation, init };
+/// let mut mlp = Mlp::new(&cpu, &config, &mut rng::stream(0, "example"));
+/// let mut adam = Adam::new(AdamConfig::new(1e-2));
+/// let mut losses = Vec::new();
+/// for _ in 0..100 {
+///     let x = tensor(&cpu, vec![-1.0, 0.0, 1.0], (1, 3, 1));
+///     let y = tensor(&cpu, vec![1.0, 0.0, 1.0], (1, 3, 1));
+///     let loss = (mlp.forward(x.leaky_traced(), Grad::Params) - y).square().mean();
+///     losses.push(loss.array());
+///     adam.step(&mut mlp, &mut loss.backward());
+/// }
+/// assert!(losses[99] < 0.5 * losses[0]);
+/// ```
 #[derive(Clone, Debug)]
 pub struct Adam {
     config: AdamConfig,
@@ -71,20 +97,20 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// A fresh optimiser.
+    /// A new optimiser, with moments of zero.
     pub fn new(config: AdamConfig) -> Self {
         Self { config, steps: 0, moments: BTreeMap::new() }
     }
 
-    /// Takes steps of another size from here on.
+    /// Changes the step size from the next step on.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.config.learning_rate = learning_rate;
     }
 
-    /// One step against `gradients`. Returns their norm before clipping. A parameter on which nothing that was
-    /// differentiated depends has a gradient of zero.
+    /// One step against `gradients`. Returns their global norm before clipping. A parameter on which the loss does not
+    /// depend has a gradient of zero.
     pub fn step(&mut self, module: &mut impl Parameters, gradients: &mut Gradients<f32, Cpu>) -> f32 {
-        // Every parameter with its gradient and its moments: a piece of work of its own.
+        // Every parameter with its gradient and its moments is a task for one thread.
         let work = module.parameters_mut().into_iter().map(|(name, parameter)| {
             let gradient =
                 std::mem::take(&mut **gradients.get_or_alloc_mut(&*parameter).expect("memory for a gradient"));
@@ -146,11 +172,46 @@ impl Adam {
     }
 }
 
-/// What a step does to each number.
+/// One Adam step for one number (Kingma & Ba 2015, Algorithm 1), up to the step itself: both moments take in the
+/// `gradient` g, with the weights `gains` = [1 - beta1, 1 - beta2],
+///
+/// ```text
+/// m <- m + (1 - beta1) (g - m)
+/// v <- v + (1 - beta2) (g^2 - v)
+/// ```
+///
+/// and `unbiased` makes of them m_hat = m / (1 - beta1^t) and v_hat = v / (1 - beta2^t), which are returned. The caller
+/// descends by rate * m_hat / (sqrt(v_hat) + epsilon). (`unbiased` and the last line are the callers' because they round in
+/// different orders, on which published numbers depend.)
+#[inline(always)]
+pub(crate) fn adam_step<T: Number>(
+    gradient: T,
+    [first, second]: [&mut T; 2],
+    gains: [T; 2],
+    unbiased: impl Fn([T; 2]) -> [T; 2],
+) -> [T; 2] {
+    average(first, gains[0], gradient);
+    average(second, gains[1], gradient * gradient);
+    unbiased([*first, *second])
+}
+
+/// An exponential moving average takes in a value.
+#[inline(always)]
+fn average<T: Number>(average: &mut T, gain: T, value: T) {
+    *average += gain * (value - *average);
+}
+
+/// f32 or f64.
+pub(crate) trait Number: Copy + AddAssign + Sub<Output = Self> + Mul<Output = Self> {}
+
+impl Number for f32 {}
+impl Number for f64 {}
+
+/// The constants of a step, the same for each number of a parameter.
 #[derive(Clone, Copy)]
 struct Rule {
     betas: [f32; 2],
-    /// The bias corrections of both moments, divided out.
+    /// The bias corrections of both moments, 1 / (1 - beta^t).
     corrections: [f32; 2],
     rate: f32,
     epsilon: f32,
@@ -168,6 +229,7 @@ impl Rule {
 }
 
 vectorised_fn! {
+    /// Adam: p <- p - decay p - rate m_hat / (sqrt(v_hat) + epsilon).
     fn update(
         parameter: &'a mut [f32],
         gradient: &'a [f32],
@@ -177,15 +239,15 @@ vectorised_fn! {
     ) {
         let Rule { betas: [beta1, beta2], corrections: [of_first, of_second], rate, epsilon, clip, decay } = rule;
         for (((p, g), m), v) in parameter.iter_mut().zip(gradient).zip(first).zip(second) {
-            let g = clip * g;
-            *m += (1.0 - beta1) * (g - *m);
-            *v += (1.0 - beta2) * (g * g - *v);
-            *p -= decay * *p + rate * (of_first * *m) / ((of_second * *v).sqrt() + epsilon);
+            let unbiased = |[m, v]: [f32; 2]| [of_first * m, of_second * v];
+            let [m, v] = adam_step(clip * g, [m, v], [1.0 - beta1, 1.0 - beta2], unbiased);
+            *p -= decay * *p + rate * m / (v.sqrt() + epsilon);
         }
     }
 }
 
 vectorised_fn! {
+    /// LaProp (Ziyin et al. 2020, Algorithm 1): m averages g / (sqrt(v_hat) + epsilon), and p <- p - decay p - rate m_hat.
     fn update_normalised(
         parameter: &'a mut [f32],
         gradient: &'a [f32],
@@ -196,14 +258,14 @@ vectorised_fn! {
         let Rule { betas: [beta1, beta2], corrections: [of_first, of_second], rate, epsilon, clip, decay } = rule;
         for (((p, g), m), v) in parameter.iter_mut().zip(gradient).zip(first).zip(second) {
             let g = clip * g;
-            *v += (1.0 - beta2) * (g * g - *v);
-            *m += (1.0 - beta1) * (g / ((of_second * *v).sqrt() + epsilon) - *m);
+            average(v, 1.0 - beta2, g * g);
+            average(m, 1.0 - beta1, g / ((of_second * *v).sqrt() + epsilon));
             *p -= decay * *p + rate * of_first * *m;
         }
     }
 }
 
-/// In eight sums side by side, which vectorise.
+/// The sum of squares, in eight partial sums, which vectorise.
 fn sum_of_squares(values: &[f32]) -> f64 {
     let mut sums = [0.0_f64; 8];
     for chunk in values.chunks(8) {

@@ -1,5 +1,22 @@
-//! Several categorical distributions side by side, as DreamerV3's latents are: a little of the uniform distribution is
-//! mixed in, so that nothing is ever impossible, and samples pass gradients straight through.
+//! Vectors of categorical variables, DreamerV3's stochastic state: probabilities with 1 % of the uniform distribution mixed
+//! in (unimix), samples with straight-through gradients, and the two KL losses of KL balancing.
+//!
+//! ```
+//! use handful::nn::dfdx::prelude::NoneTape;
+//! use handful::nn::{Categorical, device, tensor, values};
+//!
+//! // Two variables of three classes.
+//! let z = Categorical { count: 2, classes: 3, unimix: 0.01 };
+//! let logits = |numbers: [f32; 6]| tensor(&device(), numbers.to_vec(), (1, 1, 6));
+//! let posterior = logits([2.0, 0.0, 0.0, 0.0, 3.0, 0.0]);
+//! let prior = logits([0.0; 6]);
+//! let sample = z.sample(&mut NoneTape, &posterior, &mut handful::rng::stream(0, "example"));
+//! assert_eq!(values(&sample).iter().sum::<f32>(), 2.0);
+//!
+//! let kl = |free_nats| values(&z.dynamics_kl(&mut NoneTape, &posterior, &prior, free_nats))[0];
+//! assert!(kl(0.0) > 0.5 && kl(0.0) < 1.0);
+//! assert_eq!(kl(1.0), 1.0);
+//! ```
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -7,92 +24,94 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
 use super::kernels::{exp, vectorised_fn};
-use super::ops::{self, Tensor3, take, values};
+use super::ops::{Tensor3, take, values};
+use super::tape::TapeOps;
 use crate::rng::Rng;
 
-/// How many distributions, of how many classes.
+/// A vector of independent categorical variables, given by logits `[1, batch, count x classes]`.
+#[doc(alias = "unimix")]
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Categorical {
-    /// Distributions side by side.
+    /// Categorical variables.
     pub count: usize,
     /// Classes of each.
     pub classes: usize,
-    /// Share of the uniform distribution in each.
+    /// Share of the uniform distribution in each: probabilities are `(1 - unimix) softmax(logits) + unimix / classes`, so
+    /// that no class is impossible and no KL infinite. DreamerV3 uses 0.01.
     pub unimix: f32,
 }
 
-/// Which of two distributions a divergence teaches.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Side {
-    /// q of KL(q || p): the posterior, made easier to predict.
-    First,
-    /// p of KL(q || p): the prior, made to predict.
-    Second,
-}
-
 impl Categorical {
-    /// Numbers in a row of logits or of samples.
+    /// Numbers in a row of logits or of samples, `count x classes`.
     pub fn width(&self) -> usize {
         self.count * self.classes
     }
 
-    /// The softmax of each distribution's logits, nothing mixed in.
+    /// The softmax of each variable's logits, without unimix.
     fn softmax(&self, logits: &[f32]) -> Vec<f32> {
-        let mut shares = logits.to_vec();
-        softmax(&mut shares, self.classes);
-        shares
+        let mut softmaxed = logits.to_vec();
+        softmax(&mut softmaxed, self.classes);
+        softmaxed
     }
 
-    fn mixed(&self, share: f32) -> f32 {
-        (1.0 - self.unimix) * share + self.unimix / self.classes as f32
+    fn unimix(&self, softmaxed: f32) -> f32 {
+        (1.0 - self.unimix) * softmaxed + self.unimix / self.classes as f32
     }
 
-    /// The probabilities of each class, for rows of logits.
+    /// The probability of each class, unimix included, for rows of logits.
     pub fn probabilities(&self, logits: &[f32]) -> Vec<f32> {
-        self.softmax(logits).into_iter().map(|share| self.mixed(share)).collect()
+        self.softmax(logits).into_iter().map(|softmaxed| self.unimix(softmaxed)).collect()
     }
 
-    /// Takes a gradient with respect to a distribution's probabilities to one with respect to its logits, in place.
-    fn through_softmax(&self, gradient: &mut [f32], shares: &[f32]) {
-        let groups = gradient.chunks_exact_mut(self.classes).zip(shares.chunks_exact(self.classes));
-        for (gradient, shares) in groups {
-            let mean: f32 = gradient.iter().zip(shares).map(|(g, share)| g * share).sum();
-            for (g, share) in gradient.iter_mut().zip(shares) {
-                *g = (1.0 - self.unimix) * share * (*g - mean);
+    /// From the gradient with respect to the probabilities to the gradient with respect to the logits, in place.
+    fn through_softmax(&self, gradient: &mut [f32], softmaxed: &[f32]) {
+        let groups = gradient.chunks_exact_mut(self.classes).zip(softmaxed.chunks_exact(self.classes));
+        for (gradient, softmaxed) in groups {
+            let mean: f32 = gradient.iter().zip(softmaxed).map(|(g, s)| g * s).sum();
+            for (g, s) in gradient.iter_mut().zip(softmaxed) {
+                *g = (1.0 - self.unimix) * s * (*g - mean);
             }
         }
     }
 
-    /// Draws one class of each distribution: rows of ones and zeros, `[1, batch, width]`. Gradients go to the
-    /// probabilities as if the sample were they (straight-through: Bengio et al. 2013).
-    pub fn sample<T: Tape<f32, Cpu>>(self, logits: Tensor3<T>, rng: &mut Rng) -> Tensor3<T> {
+    /// Draws a class for each variable: one-hot vectors, `[1, batch, count x classes]`.
+    ///
+    /// Gradients are straight-through (Bengio et al. 2013): those of the sample pass to the probabilities, as if the sample
+    /// were `onehot + p - sg(p)`.
+    #[doc(alias = "straight-through")]
+    #[doc(alias = "one-hot")]
+    pub fn sample<T: Tape<f32, Cpu>>(self, tape: &mut T, logits: &Tensor3, rng: &mut Rng) -> Tensor3 {
+        tape.record(logits, |logits| self.straight_through_sample(logits, rng))
+    }
+
+    fn straight_through_sample<T: Tape<f32, Cpu>>(self, logits: Tensor3<T>, rng: &mut Rng) -> Tensor3<T> {
         let (logits, mut tape) = logits.split_tape();
         let shape = *logits.shape();
         assert_eq!(shape.2, self.width(), "a logit for each class");
-        let shares = self.softmax(values(&logits));
-        let mut drawn = vec![0.0; shares.len()];
-        for (drawn, shares) in drawn.chunks_exact_mut(self.classes).zip(shares.chunks_exact(self.classes)) {
+        let softmaxed = self.softmax(values(&logits));
+        let mut one_hot = vec![0.0; softmaxed.len()];
+        for (one_hot, softmaxed) in one_hot.chunks_exact_mut(self.classes).zip(softmaxed.chunks_exact(self.classes)) {
             let mut left: f32 = rng.random();
-            let class = shares.iter().position(|share| {
-                left -= self.mixed(*share);
+            let class = softmaxed.iter().position(|softmaxed| {
+                left -= self.unimix(*softmaxed);
                 left < 0.0
             });
-            drawn[class.unwrap_or(self.classes - 1)] = 1.0;
+            one_hot[class.unwrap_or(self.classes - 1)] = 1.0;
         }
-        let drawn = logits.device().tensor_from_vec(drawn, shape);
+        let sample = logits.device().tensor_from_vec(one_hot, shape);
         if T::OWNS_TAPE {
-            let drawn = drawn.clone();
+            let sample = sample.clone();
             tape.add_backward_op(move |gradients| {
-                let mut d = take(gradients, &drawn)?;
-                self.through_softmax(&mut d, &shares);
+                let mut d = take(gradients, &sample)?;
+                self.through_softmax(&mut d, &softmaxed);
                 gradients.get_or_alloc_mut(&logits)?.iter_mut().zip(d).for_each(|(dl, d)| *dl += d);
                 Ok(())
             });
         }
-        drawn.put_tape(tape)
+        sample.put_tape(tape)
     }
 
-    /// The likeliest class of each distribution, as ones and zeros.
+    /// The likeliest class of each variable, one-hot: `[1, batch, count x classes]`.
     pub fn mode(&self, logits: &Tensor3) -> Tensor3 {
         let mut ones = vec![0.0; values(logits).len()];
         for (ones, logits) in ones.chunks_exact_mut(self.classes).zip(values(logits).chunks_exact(self.classes)) {
@@ -102,39 +121,80 @@ impl Categorical {
         logits.device().tensor_from_vec(ones, *logits.shape())
     }
 
-    /// KL(q || p) of each row, summed over the distributions, `[1, batch, 1]`; but at least `free`, and without gradient
-    /// there: so much may be said for nothing. `learner` are the logits of the side that learns, `fixed` those of the other.
-    pub fn divergence<T: Tape<f32, Cpu>>(
+    /// The dynamics loss of KL balancing, `max(free_nats, KL[sg(posterior) || prior])`: trains the prior to predict the
+    /// posterior. For rows of logits; `[1, batch, 1]`.
+    ///
+    /// *KL balancing* splits one KL divergence into two losses of the same value, each with a stop-gradient sg(.) on one
+    /// side, so that the prior can be pulled towards the posterior harder than the posterior towards the prior (Hafner et
+    /// al. 2023, arXiv v1, eq. 5; weights 1 and 0.1 in the published code). *Free nats* (free bits): a KL, summed over the
+    /// variables of a row, below `free_nats` counts as that much and has no gradient.
+    #[doc(alias = "KL balancing")]
+    #[doc(alias = "stop-gradient")]
+    #[doc(alias = "free bits")]
+    #[doc(alias = "free nats")]
+    pub fn dynamics_kl<T: Tape<f32, Cpu>>(
         &self,
-        side: Side,
-        learner: Tensor3<T>,
-        fixed: &Tensor3,
-        free: f32,
-    ) -> Tensor3<T> {
-        assert_eq!(learner.shape(), fixed.shape(), "logits of two kinds of one thing");
-        let fixed = self.probabilities(values(fixed));
-        let width = self.width();
-        ops::rowwise(learner, |row, logits, slope| {
-            let shares = self.softmax(logits);
-            let fixed = &fixed[row * width..][..width];
-            let mut divergence = 0.0;
-            for ((slope, share), fixed) in slope.iter_mut().zip(&shares).zip(fixed) {
-                let own = self.mixed(*share);
-                let (q, p) = if side == Side::First { (own, *fixed) } else { (*fixed, own) };
-                let ratio = (q / p).ln();
-                divergence += q * ratio;
-                *slope = if side == Side::First { ratio + 1.0 } else { -q / p };
-            }
-            if divergence > free {
-                self.through_softmax(slope, &shares);
-            } else {
-                slope.fill(0.0);
-            }
-            divergence.max(free)
+        tape: &mut T,
+        posterior: &Tensor3,
+        prior: &Tensor3,
+        free_nats: f32,
+    ) -> Tensor3 {
+        // d KL[q || p] / dp = -q / p.
+        self.kl_with_free_nats(tape, prior, posterior, free_nats, |p, q| (q * (q / p).ln(), -q / p))
+    }
+
+    /// The representation loss of KL balancing, `max(free_nats, KL[posterior || sg(prior)])`: keeps the posterior
+    /// predictable. See [`Categorical::dynamics_kl`].
+    #[doc(alias = "KL balancing")]
+    #[doc(alias = "stop-gradient")]
+    #[doc(alias = "free bits")]
+    #[doc(alias = "free nats")]
+    pub fn representation_kl<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        posterior: &Tensor3,
+        prior: &Tensor3,
+        free_nats: f32,
+    ) -> Tensor3 {
+        // d KL[q || p] / dq = ln(q / p) + 1.
+        self.kl_with_free_nats(tape, posterior, prior, free_nats, |q, p| {
+            let log_ratio = (q / p).ln();
+            (q * log_ratio, log_ratio + 1.0)
         })
     }
 
-    /// The entropy of each row, summed over the distributions.
+    /// A KL divergence whose gradient flows into the logits of `learner` only: `term(learner, fixed)` is the part of one
+    /// class and its derivative with respect to the learner's probability.
+    fn kl_with_free_nats<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        learner: &Tensor3,
+        fixed: &Tensor3,
+        free_nats: f32,
+        term: impl Fn(f32, f32) -> (f32, f32),
+    ) -> Tensor3 {
+        assert_eq!(learner.shape(), fixed.shape(), "logits of the same variables");
+        let fixed = self.probabilities(values(fixed));
+        let width = self.width();
+        tape.rowwise(learner, |row, logits, slope| {
+            let softmaxed = self.softmax(logits);
+            let fixed = &fixed[row * width..][..width];
+            let mut kl = 0.0;
+            for i in 0..width {
+                let (part, derivative) = term(self.unimix(softmaxed[i]), fixed[i]);
+                kl += part;
+                slope[i] = derivative;
+            }
+            if kl > free_nats {
+                self.through_softmax(slope, &softmaxed);
+            } else {
+                slope.fill(0.0);
+            }
+            kl.max(free_nats)
+        })
+    }
+
+    /// The entropy of each row of logits, summed over the variables, in nats: `[batch]`.
     pub fn entropies(&self, logits: &Tensor3) -> Vec<f32> {
         let probabilities = self.probabilities(values(logits));
         let rows = probabilities.chunks_exact(self.width());
@@ -183,7 +243,7 @@ mod tests {
 
     /// Numbers computed in float64 with PyTorch.
     #[test]
-    fn divergences_and_their_gradients_are_the_references() {
+    fn kl_losses_and_their_gradients_are_the_references() {
         let cpu = device();
         let q = [
             0.705_498_92,
@@ -200,8 +260,9 @@ mod tests {
         let entropy = 0.889_078_14 + 0.174_152_09;
         near("entropy", &TWO.entropies(&posterior), &[entropy], 1e-5);
 
-        let dynamics = TWO.divergence(Side::Second, prior.leaky_trace(), &posterior, 0.0);
-        near("divergence", values(&dynamics), &[0.714_133_96], 1e-6);
+        let mut tape = OwnedTape::default();
+        let dynamics = TWO.dynamics_kl(&mut tape, &posterior, &prior, 0.0).put_tape(tape);
+        near("KL", values(&dynamics), &[0.714_133_96], 1e-6);
         let expected = [
             -0.367_277_46,
             0.236_049_24,
@@ -212,9 +273,12 @@ mod tests {
             0.075_742_68,
             -0.324_069_23,
         ];
-        near("of the prior", &gradient(&mut dynamics.sum::<Rank0, _>().backward(), &prior), &expected, 1e-6);
+        let mut gradients = dynamics.sum::<Rank0, _>().backward();
+        near("of the prior", &gradient(&mut gradients, &prior), &expected, 1e-6);
+        near("of the posterior", &gradient(&mut gradients, &posterior), &[0.0; 8], 0.0);
 
-        let representation = TWO.divergence(Side::First, posterior.leaky_trace(), &prior, 0.0) * 0.1;
+        let mut tape = OwnedTape::default();
+        let representation = TWO.representation_kl(&mut tape, &posterior, &prior, 0.0).put_tape(tape) * 0.1;
         let expected = [
             0.024_997_89,
             -0.015_432_02,
@@ -225,18 +289,16 @@ mod tests {
             -0.002_122_66,
             0.005_900_82,
         ];
-        near(
-            "of the posterior",
-            &gradient(&mut representation.sum::<Rank0, _>().backward(), &posterior),
-            &expected,
-            1e-6,
-        );
+        let mut gradients = representation.sum::<Rank0, _>().backward();
+        near("of the posterior", &gradient(&mut gradients, &posterior), &expected, 1e-6);
+        near("of the prior", &gradient(&mut gradients, &prior), &[0.0; 8], 0.0);
 
-        let free = TWO.divergence(Side::Second, prior.leaky_trace(), &posterior, 1.0);
+        let mut tape = OwnedTape::default();
+        let free = TWO.dynamics_kl(&mut tape, &posterior, &prior, 1.0).put_tape(tape);
         near("free nats", values(&free), &[1.0], 1e-9);
         near("of what is free", &gradient(&mut free.sum::<Rank0, _>().backward(), &prior), &[0.0; 8], 1e-9);
-        let without = Categorical { unimix: 0.0, ..TWO }.divergence(Side::Second, prior, &posterior, 0.0);
-        near("nothing mixed in", values(&without), &[0.387_886_16 + 0.348_961_19], 1e-5);
+        let without = Categorical { unimix: 0.0, ..TWO }.dynamics_kl(&mut NoneTape, &posterior, &prior, 0.0);
+        near("without unimix", values(&without), &[0.387_886_16 + 0.348_961_19], 1e-5);
     }
 
     #[test]
@@ -244,7 +306,8 @@ mod tests {
         let one = Categorical { count: 1, ..TWO };
         let logits = tensor(&device(), vec![2.0, 0.0, -1.0, 0.5], (1, 1, 4));
         let weights = tensor(&device(), vec![1.0, -0.5, 2.0, 0.3], (1, 1, 4));
-        let sample = one.sample(logits.leaky_trace(), &mut crate::rng::stream(0, "sample"));
+        let mut tape = OwnedTape::default();
+        let sample = one.sample(&mut tape, &logits, &mut crate::rng::stream(0, "sample")).put_tape(tape);
         assert_eq!(values(&sample).iter().sum::<f32>(), 1.0);
         let found = gradient(&mut (sample * weights).sum::<Rank0, _>().backward(), &logits);
         near("gradient", &found, &[0.154_455_8, -0.121_807_52, 0.042_690_16, -0.075_338_44], 1e-6);
@@ -253,7 +316,7 @@ mod tests {
     #[test]
     fn samples_come_as_often_as_they_should() {
         let logits = tensor(&device(), PRIOR.repeat(20_000), (1, 20_000, 8));
-        let sample = TWO.sample(logits, &mut crate::rng::stream(1, "sample"));
+        let sample = TWO.sample(&mut NoneTape, &logits, &mut crate::rng::stream(1, "sample"));
         for (i, p) in TWO.probabilities(&PRIOR).iter().enumerate() {
             let share = values(&sample).iter().skip(i).step_by(8).sum::<f32>() / 20_000.0;
             assert!((share - p).abs() < 0.012, "class {i}: {share}, expected {p}");

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::ops::{self, Grad, Tensor3, values, values_mut};
 use super::parameters::Parameters;
+use super::tape::TapeOps;
 use super::{Activation, norm};
 use crate::rng::{self, Rng};
 
@@ -174,23 +175,29 @@ impl Mlp {
         Self::from_layers(cpu, &[layers], self.layers[0].activation)
     }
 
-    /// The outputs for `x` (`[members or 1, batch, input]`).
-    pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, learning: Grad) -> Tensor3<T> {
+    /// The outputs `[members, batch, output]` for `x` (`[members or 1, batch, input]`), whose tape they take over. An input
+    /// of one member is given to all networks.
+    pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, grad: Grad) -> Tensor3<T> {
         self.layers.iter().enumerate().fold(x, |x, (i, Layer { weight, bias, norm, activation })| {
-            // Beyond the first layer, the input is no data.
-            let within = if i > 0 && learning == Grad::Params { Grad::Both } else { learning };
-            let affine = |x, activation| ops::dense(x, weight, bias, activation, within);
-            let inside = if learning == Grad::Input { learning } else { Grad::Both };
+            // Only the first layer stops gradients on its way to the input; to the others they must come through it.
+            let of_norm = if grad == Grad::Input { Grad::Input } else { Grad::Both };
+            let of_dense = if i == 0 { grad } else { of_norm };
+            let affine = |x, activation| ops::dense(x, weight, bias, activation, of_dense);
             match norm {
                 NormParameters::None => affine(x, *activation),
                 NormParameters::Layer { gain, shift } => {
-                    norm::layer_norm(affine(x, Activation::Identity), gain, shift, *activation, inside)
+                    norm::layer_norm(affine(x, Activation::Identity), gain, shift, *activation, of_norm)
                 }
                 NormParameters::Rms { gain } => {
-                    norm::rms_norm(affine(x, Activation::Identity), gain, *activation, inside)
+                    norm::rms_norm(affine(x, Activation::Identity), gain, *activation, of_norm)
                 }
             }
         })
+    }
+
+    /// [`Mlp::forward`] on a tape that is handed on, see [`super::tape`].
+    pub fn on<T: Tape<f32, Cpu>>(&self, tape: &mut T, x: &Tensor3, grad: Grad) -> Tensor3 {
+        tape.record(x, |x| self.forward(x, grad))
     }
 }
 

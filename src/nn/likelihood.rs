@@ -67,7 +67,7 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
     targets: &Tensor3,
     bounds: &LogVarianceBounds,
     beta: f32,
-    learning: Grad,
+    grad: Grad,
 ) -> Tensor3<T> {
     let (head, mut tape) = head.split_tape();
     let &(_, batch, width) = head.shape();
@@ -93,7 +93,7 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
     let [losses, mut d_max, mut d_min]: [Vec<f32>; 3] =
         std::array::from_fn(|k| (0..outputs).map(|i| of_networks.iter().map(|sums| sums[k][i]).sum()).collect());
     let mut loss = losses.iter().map(|loss| f64::from(*loss)).sum::<f64>();
-    if learning == Grad::Both {
+    if grad == Grad::Both {
         loss += f64::from(BOUND_PENALTY * maxima.iter().zip(minima).map(|(max, min)| max - min).sum::<f32>());
         d_max.iter_mut().for_each(|d| *d += BOUND_PENALTY);
         d_min.iter_mut().for_each(|d| *d -= BOUND_PENALTY);
@@ -105,7 +105,7 @@ pub fn bounded_nll<T: Tape<f32, Cpu>>(
         tape.add_backward_op(move |gradients| {
             let scale = take(gradients, &loss)?[0];
             let mut parts = vec![(&head, &d_head)];
-            if learning == Grad::Both {
+            if grad == Grad::Both {
                 parts.extend([(&max, &d_max), (&min, &d_min)]);
             }
             for (of, d) in parts {

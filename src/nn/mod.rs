@@ -16,9 +16,11 @@ pub mod norm;
 pub mod ops;
 pub(crate) mod parameters;
 pub mod recurrent;
+pub mod tape;
 pub mod two_hot;
 
 pub use crate::checkpoint::Weights;
+pub(crate) use adam::adam_step;
 pub use adam::{Adam, AdamConfig};
 pub use categorical::Categorical;
 pub use dfdx;
@@ -31,6 +33,7 @@ pub use ops::{Grad, Tensor2, Tensor3, values, values_mut};
 pub(crate) use parameters::parameters_of_fields;
 pub use parameters::{Parameters, copy_parameters, polyak};
 pub use recurrent::BlockDense;
+pub use tape::TapeOps;
 pub use two_hot::SymexpBins;
 
 use dfdx::tensor::{Cache, Cpu, TensorFrom};

@@ -6,6 +6,7 @@ use dfdx::tensor::Cpu;
 use super::kernels::{Activation, silu, silu_slope, vectorised_fn};
 use super::ops::{Grad, Tensor3, take, values};
 use super::parameters::Parameters;
+use super::tape::TapeOps;
 
 /// Layer normalisation (Ba et al. 2016), then the activation:
 /// `activation(gain (x - mean) / sqrt(variance + 1e-5) + shift)`; gain and shift `[members, 1, features]`.
@@ -14,20 +15,15 @@ pub fn layer_norm<T: Tape<f32, Cpu>>(
     gain: &Tensor3,
     shift: &Tensor3,
     activation: Activation,
-    learning: Grad,
+    grad: Grad,
 ) -> Tensor3<T> {
-    normalised(x, gain, Some(shift), Rule { centred: true, epsilon: 1e-5, activation }, learning)
+    normalised(x, gain, Some(shift), Rule { centred: true, epsilon: 1e-5, activation }, grad)
 }
 
 /// Root-mean-square normalisation (Zhang & Sennrich 2019), then the activation:
 /// `activation(gain x / sqrt(mean(x^2) + 1e-4))`; gain `[members, 1, features]`. The epsilon is DreamerV3's.
-pub fn rms_norm<T: Tape<f32, Cpu>>(
-    x: Tensor3<T>,
-    gain: &Tensor3,
-    activation: Activation,
-    learning: Grad,
-) -> Tensor3<T> {
-    normalised(x, gain, None, Rule { centred: false, epsilon: 1e-4, activation }, learning)
+pub fn rms_norm<T: Tape<f32, Cpu>>(x: Tensor3<T>, gain: &Tensor3, activation: Activation, grad: Grad) -> Tensor3<T> {
+    normalised(x, gain, None, Rule { centred: false, epsilon: 1e-4, activation }, grad)
 }
 
 /// A learned [`rms_norm`] with a SiLU after it, for layers that are no part of an [`super::Mlp`].
@@ -45,6 +41,11 @@ impl RmsNorm {
     /// The output for `x` `[1, batch, features]`.
     pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>) -> Tensor3<T> {
         rms_norm(x, &self.gain, Activation::Silu, Grad::Both)
+    }
+
+    /// [`RmsNorm::forward`] on a tape that is handed on, see [`super::tape`].
+    pub fn on<T: Tape<f32, Cpu>>(&self, tape: &mut T, x: &Tensor3) -> Tensor3 {
+        tape.record(x, |x| self.forward(x))
     }
 }
 
@@ -72,7 +73,7 @@ fn normalised<T: Tape<f32, Cpu>>(
     gain: &Tensor3,
     shift: Option<&Tensor3>,
     rule: Rule,
-    learning: Grad,
+    grad: Grad,
 ) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(members, batch, features) = x.shape();
@@ -108,7 +109,7 @@ fn normalised<T: Tape<f32, Cpu>>(
                 let own = member * features..(member + 1) * features;
                 backward(
                     dx,
-                    if learning == Grad::Input { &mut [] } else { &mut d_gain[own.clone()] },
+                    if grad == Grad::Input { &mut [] } else { &mut d_gain[own.clone()] },
                     &mut d_shift[own],
                     &dy[rows.clone()],
                     &values(&x)[rows],
@@ -120,7 +121,7 @@ fn normalised<T: Tape<f32, Cpu>>(
             }
             **gradients.get_or_alloc_mut(&gain)? = d_gain;
             if let Some(shift) = &shift
-                && learning != Grad::Input
+                && grad != Grad::Input
             {
                 **gradients.get_or_alloc_mut(shift)? = d_shift;
             }

@@ -54,14 +54,17 @@ pub(crate) fn take(gradients: &mut Gradients<f32, Cpu>, of: &Tensor3) -> Result<
     Ok(std::mem::take(gradients.get_or_alloc_mut(of)?))
 }
 
-/// Where an operation's gradients flow to.
+/// Which gradients flow out of an operation: the place of the papers' stop-gradient operator sg(.).
+#[doc(alias = "stop-gradient")]
+#[doc(alias = "stop_gradient")]
+#[doc(alias = "detach")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Grad {
-    /// Gradients flow into the parameters and through to the input.
+    /// Into the parameters, and through to the input.
     Both,
-    /// Gradients flow into the parameters only: the input is data, and nobody asks for its gradient.
+    /// Into the parameters only: f(sg(x)). The input is data, or belongs to another loss.
     Params,
-    /// Gradients flow through to the input only.
+    /// Through to the input only: the parameters are frozen, as a critic's are in the loss of its actor.
     Input,
 }
 
@@ -72,7 +75,7 @@ pub fn dense<T: Tape<f32, Cpu>>(
     w: &Tensor3,
     b: &Tensor3,
     activation: Activation,
-    learning: Grad,
+    grad: Grad,
 ) -> Tensor3<T> {
     let (x, mut tape) = x.split_tape();
     let &(x_members, batch, input) = x.shape();
@@ -94,7 +97,7 @@ pub fn dense<T: Tape<f32, Cpu>>(
             let mut dz = take(gradients, &y)?;
             kernels::through_activation(&mut dz, before.as_deref().unwrap_or(values(&y)), activation);
             // Both at once: neither waits for the other's last task.
-            let (to_parameters, to_input) = (learning != Grad::Input, learning != Grad::Params);
+            let (to_parameters, to_input) = (grad != Grad::Input, grad != Grad::Params);
             let mut of_parameters =
                 to_parameters.then(|| Ok((take(gradients, &w)?, take(gradients, &b)?))).transpose()?;
             let mut of_input = to_input.then(|| take(gradients, &x)).transpose()?;

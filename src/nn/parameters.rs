@@ -67,20 +67,31 @@ pub(crate) fn under_names<T>(parts: impl IntoIterator<Item = (&'static str, Vec<
     parts.into_iter().flat_map(under).collect()
 }
 
-/// Makes a struct's parameters those of some of its fields, each under the field's name.
+/// Makes a struct's parameters those of some of its fields, each under the field's name; `field as "name"` keeps another
+/// name, under which checkpoints know it.
 macro_rules! parameters_of_fields {
-    ($type:ty: $($field:ident),*) => {
+    ($type:ty: $($field:ident $(as $name:literal)?),*) => {
         impl $crate::nn::Parameters for $type {
             fn parameters(&self) -> Vec<(String, &$crate::nn::Tensor3)> {
-                let parts = [$((stringify!($field), self.$field.parameters())),*];
+                let parts = [$(($crate::nn::parameters::name_of!($field $($name)?), self.$field.parameters())),*];
                 $crate::nn::parameters::under_names(parts)
             }
 
             fn parameters_mut(&mut self) -> Vec<(String, &mut $crate::nn::Tensor3)> {
-                let parts = [$((stringify!($field), self.$field.parameters_mut())),*];
+                let parts = [$(($crate::nn::parameters::name_of!($field $($name)?), self.$field.parameters_mut())),*];
                 $crate::nn::parameters::under_names(parts)
             }
         }
     };
 }
 pub(crate) use parameters_of_fields;
+
+macro_rules! name_of {
+    ($field:ident) => {
+        stringify!($field)
+    };
+    ($field:ident $name:literal) => {
+        $name
+    };
+}
+pub(crate) use name_of;

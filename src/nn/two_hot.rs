@@ -1,23 +1,45 @@
-//! Numbers of any size as distributions over bins (DreamerV3): what is learned is a classification, whose gradients do
-//! not grow with the numbers.
+//! Two-hot symexp regression (DreamerV3): a number of any size is learned as a categorical distribution over exponentially
+//! spaced bins, with a cross-entropy whose gradients do not grow with the number.
+//!
+//! ```
+//! use handful::nn::dfdx::prelude::NoneTape;
+//! use handful::nn::{SymexpBins, device, tensor, values};
+//!
+//! let bins = SymexpBins::new(255, 20.0);
+//! // Between which bins 1.5 lies, and how its weight is split between them.
+//! let (lower, weights) = bins.encode(1.5);
+//! assert_eq!((lower, weights[0] + weights[1]), (132, 1.0));
+//! // Zero logits predict exactly zero, at a loss of ln 255 for any target.
+//! let logits = tensor(&device(), vec![0.0; 255], (1, 1, 255));
+//! assert_eq!(bins.decode(&logits), [0.0]);
+//! let loss = bins.loss(&mut NoneTape, &logits, &[&[1.5]]);
+//! assert!((values(&loss)[0] - 255_f32.ln()).abs() < 1e-4);
+//! ```
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
 use super::categorical::softmax;
-use super::ops::{self, Tensor3, values};
+use super::ops::{Tensor3, values};
+use super::tape::TapeOps;
 
-/// `sign(x) ln(1 + |x|)`: large numbers, tamed.
+/// `sign(x) ln(1 + |x|)`: a logarithm for both signs (Hafner et al. 2023, arXiv v1, eq. 2).
 pub fn symlog(x: f32) -> f32 {
     x.signum() * x.abs().ln_1p()
 }
 
-/// The inverse of [`symlog`].
+/// `sign(x) (exp(|x|) - 1)`, the inverse of [`symlog`].
 pub fn symexp(x: f32) -> f32 {
     x.signum() * x.abs().exp_m1()
 }
 
-/// Bins that grow exponentially to both sides of zero.
+/// Bins whose distance grows exponentially to both sides of zero, `b_i = symexp(x_i)` for evenly spaced `x_i`.
+///
+/// Targets are split linearly between two bins, in raw space, as the published code does. (The paper's first version had
+/// evenly spaced bins in symlog space.)
+#[doc(alias = "two-hot")]
+#[doc(alias = "twohot")]
+#[doc(alias = "distributional critic")]
 #[derive(Clone, Debug, PartialEq)]
 pub struct SymexpBins {
     bins: Vec<f32>,
@@ -40,8 +62,8 @@ impl SymexpBins {
         self.bins.len()
     }
 
-    /// Where `y` lies: a bin, and the weights of it and of the next one, linear between the two. Beyond the last bins, all
-    /// weight is on them.
+    /// The two-hot code of `y`: a bin's index, and the weights of that bin and the next one, linear between the two. Numbers
+    /// beyond the outermost bins get all their weight there.
     pub fn encode(&self, y: f32) -> (usize, [f32; 2]) {
         let last = self.bins.len() - 1;
         let y = y.clamp(self.bins[0], self.bins[last]);
@@ -50,8 +72,8 @@ impl SymexpBins {
         (lower, [1.0 - upper, upper])
     }
 
-    /// The number that a row of probabilities stands for: the expected bin. Summed in pairs from both sides, so that even
-    /// probabilities give exactly zero, which the sum from left to right loses among numbers of 1e8.
+    /// The expected bin under a row of probabilities. Summed in pairs of opposite bins, so that uniform probabilities give
+    /// exactly zero, which a sum from left to right loses among bins of 1e8.
     fn expected(&self, probabilities: &[f32]) -> f32 {
         let half = self.bins.len() / 2;
         let (left, right) = probabilities.split_at(half);
@@ -59,29 +81,31 @@ impl SymexpBins {
         pairs.map(|((minus, plus), bin)| (plus - minus) * bin).sum()
     }
 
-    /// The number that each row of logits stands for.
-    pub fn read(&self, logits: &Tensor3) -> Vec<f32> {
+    /// The prediction of each row of logits `[1, batch, bins]`: the expected bin, `[batch]`.
+    pub fn decode(&self, logits: &Tensor3) -> Vec<f32> {
         let mut probabilities = values(logits).to_vec();
         softmax(&mut probabilities, self.bins.len());
         probabilities.chunks_exact(self.bins.len()).map(|row| self.expected(row)).collect()
     }
 
-    /// The cross-entropy between each row of logits and the sum of the two-hot codes of that row's targets, `[1, batch, 1]`.
+    /// The cross-entropy between each row of logits `[1, batch, bins]` and the two-hot codes of its targets, summed over the
+    /// lists of targets, `[batch]` each: `[1, batch, 1]`.
     ///
     /// # Panics
     /// If there is not one list of targets as long as the batch for each.
-    pub fn loss<T: Tape<f32, Cpu>>(&self, logits: Tensor3<T>, targets: &[&[f32]]) -> Tensor3<T> {
+    #[doc(alias = "cross-entropy")]
+    pub fn loss<T: Tape<f32, Cpu>>(&self, tape: &mut T, logits: &Tensor3, targets: &[&[f32]]) -> Tensor3 {
         let &(_, batch, width) = logits.shape();
         assert_eq!(width, self.bins.len(), "a logit for each bin");
         assert!(targets.iter().all(|each| each.len() == batch), "targets for each row");
-        ops::rowwise(logits, |row, logits, slope| {
+        tape.rowwise(logits, |row, logits, slope| {
             // -sum t ln softmax(l), with slope sum(t) softmax(l) - t.
             slope.copy_from_slice(logits);
             softmax(slope, width);
             // The softmax is exp(l - normaliser); read it off where it is largest.
-            let (likeliest, share) =
+            let (likeliest, highest) =
                 slope.iter().enumerate().fold((0, 0.0), |best, (i, p)| if *p > best.1 { (i, *p) } else { best });
-            let normaliser = logits[likeliest] - share.ln();
+            let normaliser = logits[likeliest] - highest.ln();
             slope.iter_mut().for_each(|p| *p *= targets.len() as f32);
             let mut loss = 0.0;
             for target in targets {
@@ -142,13 +166,13 @@ mod tests {
         }
         let cpu = device();
         let blank = tensor(&cpu, vec![0.0; 255], (1, 1, 255));
-        assert_eq!(bins.read(&blank), [0.0]);
-        near("blank", values(&bins.loss(blank, &[&[3.0]]))[0], 5.541_263_55, 1e-6);
+        assert_eq!(bins.decode(&blank), [0.0]);
+        near("blank", values(&bins.loss(&mut NoneTape, &blank, &[&[3.0]]))[0], 5.541_263_55, 1e-6);
         let logits: Vec<f32> = (0..255).map(|i| -0.5 * ((i as f32 - 130.0) / 3.0).powi(2)).collect();
         let logits = tensor(&cpu, logits, (1, 1, 255));
-        near("read", bins.read(&logits)[0], 0.775_887_2, 1e-4);
+        near("decode", bins.decode(&logits)[0], 0.775_887_2, 1e-4);
         for (y, loss) in [(1.5, 2.463_815_85), (0.0, 2.517_550_82), (-0.02, 2.563_152_85)] {
-            near("loss", values(&bins.loss(logits.clone(), &[&[y]]))[0], loss, 1e-5);
+            near("loss", values(&bins.loss(&mut NoneTape, &logits, &[&[y]]))[0], loss, 1e-5);
         }
     }
 }

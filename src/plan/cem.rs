@@ -1,12 +1,15 @@
-//! The cross-entropy method as PETS uses it (Chua et al. 2018): truncated normal samples whose spread shrinks near
-//! the bounds, momentum, and a mean that is kept from step to step.
+//! The cross-entropy method (CEM; Rubinstein 1999, de Boer et al. 2005) as PETS uses it for planning (Chua et al. 2018,
+//! section 5 and Algorithm 1): sample sequences from a diagonal Gaussian, refit it to the best of them, repeat.
+//!
+//! As in the PETS authors' code: samples are truncated to two standard deviations, the variance is constrained so
+//! that they stay within the bounds, the refit is smoothed, and the mean is executed and kept as the next warm start.
 
 use serde::{Deserialize, Serialize};
 
-use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, refit, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::{self, Rng};
 
-/// Variance of the search at the start of every plan: (upper - lower)^2 / 16.
+/// Variance of the search distribution at the start of every plan: (upper - lower)^2 / 16.
 const START_VARIANCE: f64 = 0.25;
 /// The search ends when no variance is above this.
 const CONVERGED: f64 = 1e-3;
@@ -15,15 +18,15 @@ const CONVERGED: f64 = 1e-3;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CemConfig {
-    /// Steps that it looks ahead.
+    /// The planning horizon, in actions.
     pub horizon: usize,
-    /// ActionSequences tried in an iteration.
+    /// Candidates in an iteration.
     pub population: usize,
-    /// The best of them, which shape the next iteration.
+    /// The best candidates, to which the distribution is refitted.
     pub elites: usize,
-    /// Iterations.
+    /// Iterations, at most.
     pub iterations: usize,
-    /// Weight of the old mean and variance.
+    /// Weight of the old mean and variance in a refit.
     pub momentum: f64,
 }
 
@@ -33,19 +36,23 @@ impl Default for CemConfig {
     }
 }
 
-/// The planner of PETS. It executes the mean of its last distribution, which a lucky sample cannot
-/// mislead.
+/// The cross-entropy method, the planner of PETS. It executes the mean of its last distribution rather than the best
+/// sample, whose return may be an outlier of the model's noise.
+#[doc(alias = "CEM")]
+#[doc(alias = "cross-entropy method")]
+#[derive(Clone, Debug)]
 pub struct Cem {
     config: CemConfig,
-    actions: usize,
+    action_size: usize,
+    /// Mean of the search distribution, `[horizon, actions]`: the warm start of the next search.
     mean: Vec<f64>,
 }
 
 impl Cem {
-    /// For actions of so many numbers.
-    pub fn new(config: CemConfig, actions: usize) -> Self {
-        let mean = vec![0.0; config.horizon * actions];
-        Self { config, actions, mean }
+    /// A planner for actions of `action_size` numbers.
+    pub fn new(config: CemConfig, action_size: usize) -> Self {
+        let mean = vec![0.0; config.horizon * action_size];
+        Self { config, action_size, mean }
     }
 }
 
@@ -62,17 +69,17 @@ impl Planner for Cem {
             if variance.iter().all(|v| *v < CONVERGED) {
                 break;
             }
-            // Sample.
-            let mut candidates = ActionSequences::new(horizon, self.actions);
+            // Sample: a ~ N(mean, variance), truncated.
+            let mut candidates = ActionSequences::new(horizon, self.action_size);
             for _ in 0..population {
                 let row = self.mean.iter().zip(&variance);
                 candidates
                     .values
                     .extend(row.map(|(m, v)| (m + constrained(*v, *m).sqrt() * rng::truncated_normal(rng)) as f32));
             }
-            // Score.
+            // Evaluate.
             let returns = objective.returns(&candidates);
-            // Refit.
+            // Refit to the elites.
             let order = best(&returns, elites);
             best_return = best_return.max(returns[order[0]]);
             let elites: Vec<&[f32]> = order.iter().map(|&i| candidates.row(i)).collect();
@@ -83,7 +90,26 @@ impl Planner for Cem {
     }
 
     fn shift(&mut self, steps: usize) {
-        shifted(&mut self.mean, steps, self.actions, &vec![0.0; self.actions]);
+        shifted(&mut self.mean, steps, self.action_size, &vec![0.0; self.action_size]);
+    }
+}
+
+/// CEM's refit: mean and variance of the search distribution move to those of the elites (the maximum-likelihood fit, so
+/// the population variance), smoothed (de Boer et al. 2005, "smoothed updating"):
+///
+/// ```text
+/// mean     <- momentum mean     + (1 - momentum) mean(elites)
+/// variance <- momentum variance + (1 - momentum) var(elites)
+/// ```
+///
+/// `mean`, `variance` and each of the elites are `[horizon, actions]`.
+pub(super) fn refit(mean: &mut [f64], variance: &mut [f64], elites: &[&[f32]], momentum: f64) {
+    let n = elites.len() as f64;
+    for (i, (mean, variance)) in mean.iter_mut().zip(variance).enumerate() {
+        let elite_mean = elites.iter().map(|row| f64::from(row[i])).sum::<f64>() / n;
+        let elite_variance = elites.iter().map(|row| (f64::from(row[i]) - elite_mean).powi(2)).sum::<f64>() / n;
+        *mean = momentum * *mean + (1.0 - momentum) * elite_mean;
+        *variance = momentum * *variance + (1.0 - momentum) * elite_variance;
     }
 }
 
@@ -95,6 +121,18 @@ fn constrained(variance: f64, mean: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn elites_are_refitted_with_momentum() {
+        let elites: [&[f32]; 3] = [&[0.2, -0.4], &[0.6, 0.0], &[0.4, 0.1]];
+        let (mut mean, mut variance) = ([0.0, 0.0], [0.25, 0.25]);
+        refit(&mut mean, &mut variance, &elites, 0.1);
+        let near = |a: f64, b: f64| assert!((a - b).abs() < 1e-7, "{a}, expected {b}");
+        near(mean[0], 0.36);
+        near(mean[1], -0.09);
+        near(variance[0], 0.049);
+        near(variance[1], 0.067);
+    }
 
     #[test]
     fn the_spread_shrinks_near_the_bounds() {

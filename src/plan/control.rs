@@ -1,4 +1,5 @@
-//! Receding-horizon control: plan far ahead, act for a little, plan again from where that led.
+//! Receding-horizon control (model predictive control, MPC): plan over a horizon, execute the first actions, plan again
+//! from where they led.
 
 use std::collections::VecDeque;
 
@@ -12,7 +13,9 @@ use crate::rng::Rng;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ControlConfig {
-    /// Control steps for which each planned action is held: the planner decides less often, and so farther ahead.
+    /// Control steps for which each planned action is repeated. The planner then decides less often, and with the same
+    /// horizon looks further ahead.
+    #[doc(alias = "frame skip")]
     pub action_repeat: usize,
     /// Planned actions that are executed before the next plan is made.
     pub replan_every: usize,
@@ -26,12 +29,13 @@ impl Default for ControlConfig {
 
 impl ControlConfig {
     /// # Errors
-    /// If there is nothing to execute between two plans.
+    /// If there is nothing to execute between two plans, or more than a plan holds.
     pub(crate) fn check(&self, planner: &PlannerConfig) -> Result<()> {
         planner.check()?;
         if self.action_repeat == 0 || self.replan_every == 0 || self.replan_every > planner.horizon() {
             return Err(Error::BadSetting(
-                "control: `hold` and `replan_every` must be at least 1, and `replan_every` no longer than the horizon"
+                "control: `action_repeat` and `replan_every` must be at least 1, and `replan_every` no longer than the \
+                 horizon"
                     .into(),
             ));
         }
@@ -39,75 +43,128 @@ impl ControlConfig {
     }
 }
 
-/// A planner that is asked again every few steps.
+/// A planner as a controller: it plans, executes the first `replan_every` actions, and plans again.
+///
+/// ```
+/// use handful::plan::{ActionSequences, Cem, CemConfig, ControlConfig, RecedingHorizon};
+/// use handful::rng;
+///
+/// // A point on a line moves by 0.1 * action in each time step, and should come to 0.
+/// let planner = Cem::new(CemConfig { horizon: 5, population: 50, elites: 5, ..CemConfig::default() }, 1);
+/// let mut controller = RecedingHorizon::new(Box::new(planner), 1, &ControlConfig::default());
+/// let mut rng = rng::stream(0, "example");
+/// let mut x = 0.8;
+/// for _ in 0..15 {
+///     let mut objective = |candidates: &ActionSequences| -> Vec<f32> {
+///         let imagined_return = |actions: &[f32]| {
+///             let (mut x, mut total) = (x, 0.0);
+///             for action in actions {
+///                 x += 0.1 * action;
+///                 total -= x * x;
+///             }
+///             total
+///         };
+///         candidates.rows().map(imagined_return).collect()
+///     };
+///     x += 0.1 * controller.act(&mut objective, &mut |_| {}, &mut rng)[0];
+/// }
+/// assert!(x.abs() < 0.1);
+/// ```
+#[doc(alias = "MPC")]
+#[doc(alias = "model predictive control")]
+#[doc(alias = "receding horizon")]
 pub struct RecedingHorizon {
     config: ControlConfig,
     planner: Box<dyn Planner>,
-    actions: usize,
-    /// What is left to execute before the next plan.
-    ahead: VecDeque<f32>,
+    action_size: usize,
+    /// What is left to execute of the plan, in control steps.
+    queue: VecDeque<f32>,
 }
 
 impl RecedingHorizon {
-    /// A controller for actions of so many numbers.
-    pub fn new(planner: Box<dyn Planner>, actions: usize, config: &ControlConfig) -> Self {
-        Self { config: config.clone(), planner, actions, ahead: VecDeque::new() }
+    /// A controller for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If `action_repeat` or `replan_every` is 0.
+    pub fn new(planner: Box<dyn Planner>, action_size: usize, config: &ControlConfig) -> Self {
+        let ControlConfig { action_repeat, replan_every } = *config;
+        assert!(action_repeat > 0 && replan_every > 0, "`action_repeat` and `replan_every` must be at least 1");
+        Self { config: config.clone(), planner, action_size, queue: VecDeque::new() }
     }
 
-    /// Forgets everything: a new episode.
+    /// Forgets everything: a new episode begins.
     pub fn reset(&mut self) {
         self.planner.reset();
-        self.ahead.clear();
+        self.queue.clear();
     }
 
-    /// The next action. The objective, which is asked about sequences of control steps, is asked only when it is time to
-    /// plan; and then the observer sees what was tried, in control steps too.
+    /// The next action. Plans if nothing is left of the last plan. The objective is asked about sequences of control steps,
+    /// in which each planned action is repeated; the observer sees control steps, too.
+    ///
+    /// # Panics
+    /// If the planner's plan is shorter than `replan_every` actions.
     pub fn act(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Vec<f32> {
-        if self.ahead.is_empty() {
+        if self.queue.is_empty() {
             let ControlConfig { action_repeat, replan_every } = self.config;
-            let mut watch = |iteration: &Iteration| {
+            let mut observe = |iteration: &Iteration| {
                 let Iteration { index, candidates, returns, mean } = *iteration;
-                let mean: Vec<f64> = held(mean, self.actions, action_repeat);
-                observer(&Iteration { index, candidates: &stretched(candidates, action_repeat), returns, mean: &mean });
+                let mean: Vec<f64> = repeated(mean, self.action_size, action_repeat);
+                let candidates = &in_control_steps(candidates, action_repeat);
+                observer(&Iteration { index, candidates, returns, mean: &mean });
             };
-            let plan = self.planner.plan(&mut Held { objective, action_repeat }, &mut watch, rng);
+            let plan = self.planner.plan(&mut Repeated { objective, action_repeat }, &mut observe, rng);
             self.planner.shift(replan_every);
-            self.ahead.extend(held(&plan.actions[..replan_every * self.actions], self.actions, action_repeat));
+            let executed = plan.actions.get(..replan_every * self.action_size).unwrap_or_else(|| {
+                let numbers = plan.actions.len();
+                panic!("`replan_every` is {replan_every}, but the planner's plan has {numbers} numbers only")
+            });
+            self.queue.extend(repeated(executed, self.action_size, action_repeat));
         }
-        self.ahead.drain(..self.actions).collect()
+        self.queue.drain(..self.action_size).collect()
     }
 }
 
-/// An objective of control steps, asked about actions that are each held for several.
-struct Held<'a> {
+impl std::fmt::Debug for RecedingHorizon {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let Self { config, action_size, queue, .. } = self;
+        f.debug_struct("RecedingHorizon")
+            .field("config", config)
+            .field("action_size", action_size)
+            .field("queue", queue)
+            .finish_non_exhaustive()
+    }
+}
+
+/// An objective of control steps, asked about actions that are each repeated.
+struct Repeated<'a> {
     objective: &'a mut dyn Objective,
     action_repeat: usize,
 }
 
-impl Objective for Held<'_> {
+impl Objective for Repeated<'_> {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
-        self.objective.returns(&stretched(sequences, self.action_repeat))
+        self.objective.returns(&in_control_steps(sequences, self.action_repeat))
     }
 
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
-        let (returns, slopes) = self.objective.gradients(&stretched(sequences, self.action_repeat));
-        // A held action acts in all of its steps.
-        let of_actions = slopes.chunks_exact(self.action_repeat * sequences.actions).flat_map(|steps| {
+        let (returns, gradients) = self.objective.gradients(&in_control_steps(sequences, self.action_repeat));
+        // By the chain rule, the gradient of a repeated action is the sum over its repetitions.
+        let of_actions = gradients.chunks_exact(self.action_repeat * sequences.actions).flat_map(|steps| {
             (0..sequences.actions).map(|i| steps.iter().skip(i).step_by(sequences.actions).sum::<f32>())
         });
         (returns, of_actions.collect())
     }
 }
 
-fn stretched(sequences: &ActionSequences, action_repeat: usize) -> ActionSequences {
+fn in_control_steps(sequences: &ActionSequences, action_repeat: usize) -> ActionSequences {
     ActionSequences {
         horizon: sequences.horizon * action_repeat,
         actions: sequences.actions,
-        values: held(&sequences.values, sequences.actions, action_repeat),
+        values: repeated(&sequences.values, sequences.actions, action_repeat),
     }
 }
 
-/// Each action so many times in a row.
-fn held<T: Copy>(values: &[T], actions: usize, action_repeat: usize) -> Vec<T> {
-    values.chunks_exact(actions).flat_map(|action| action.repeat(action_repeat)).collect()
+/// Each action `action_repeat` times in a row.
+fn repeated<T: Copy>(values: &[T], action_size: usize, action_repeat: usize) -> Vec<T> {
+    values.chunks_exact(action_size).flat_map(|action| action.repeat(action_repeat)).collect()
 }

@@ -1,31 +1,33 @@
-//! Planning by gradient ascent on the actions themselves, for objectives that can be differentiated.
+//! Gradient shooting: gradient ascent on the actions themselves, by Adam through the unrolled objective.
 //!
-//! Gradients find the errors of a learned model faster than anything else, and contact hides from them what
-//! lies beyond it; so there are several starts, clipped gradients, and few steps.
+//! Gradients exploit the errors of a learned model more effectively than sampling does, they are zero or misleading
+//! across contacts, and they explode over long horizons; so there are several starts, clipped gradients, and few steps.
 
 use serde::{Deserialize, Serialize};
 
 use super::noise::ColoredNoise;
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted};
+use crate::nn::adam_step;
 use crate::rng::Rng;
 
 /// Settings of [`Gradient`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GradientConfig {
-    /// Steps that it looks ahead.
+    /// The planning horizon, in actions.
     pub horizon: usize,
-    /// ActionSequences that climb side by side: the plan before, and random ones.
+    /// Sequences that are improved side by side: the last plan (the warm start), and random ones.
     pub starts: usize,
-    /// Steps of ascent.
+    /// Steps of gradient ascent.
     pub iterations: usize,
     /// Step size (Adam).
     pub rate: f64,
-    /// A sequence's gradient with a larger norm is scaled down to it.
+    /// A gradient of a sequence with a larger norm is scaled down to this norm.
     pub max_norm: f64,
-    /// Standard deviation of the random starts, and the exponent of their noise.
+    /// Standard deviation of the random starts.
+    #[doc(alias = "standard deviation")]
     pub deviation: f64,
-    /// See [`ColoredNoise`].
+    /// Exponent beta of the random starts' noise ([`ColoredNoise`]).
     pub noise_beta: f64,
 }
 
@@ -35,20 +37,25 @@ impl Default for GradientConfig {
     }
 }
 
-/// The planner.
+/// Gradient ascent from several starts.
+#[doc(alias = "gradient shooting")]
+#[derive(Clone, Debug)]
 pub struct Gradient {
     config: GradientConfig,
-    actions: usize,
+    action_size: usize,
     noise: ColoredNoise,
-    /// The plan before.
+    /// The last plan, `[horizon, actions]`.
     before: Vec<f64>,
 }
 
 impl Gradient {
-    /// For actions of so many numbers.
-    pub fn new(config: GradientConfig, actions: usize) -> Self {
+    /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If the horizon is shorter than 2.
+    pub fn new(config: GradientConfig, action_size: usize) -> Self {
         let noise = ColoredNoise::new(config.noise_beta, config.horizon);
-        Self { before: vec![0.0; config.horizon * actions], noise, actions, config }
+        Self { before: vec![0.0; config.horizon * action_size], noise, action_size, config }
     }
 }
 
@@ -59,10 +66,10 @@ impl Planner for Gradient {
 
     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let GradientConfig { horizon, starts, deviation, .. } = self.config;
-        let mut sequences = ActionSequences::new(horizon, self.actions);
+        let mut sequences = ActionSequences::new(horizon, self.action_size);
         sequences.values.extend(self.before.iter().map(|a| *a as f32));
         for _ in 1..starts {
-            let noise = self.noise.sample_actions(self.actions, rng);
+            let noise = self.noise.sample_actions(self.action_size, rng);
             sequences.values.extend(noise.iter().map(|noise| (deviation * noise).clamp(-1.0, 1.0) as f32));
         }
         let plan = ascend(sequences, &self.config, objective, observer);
@@ -71,13 +78,13 @@ impl Planner for Gradient {
     }
 
     fn shift(&mut self, steps: usize) {
-        let last = self.before[self.before.len() - self.actions..].to_vec();
-        shifted(&mut self.before, steps, self.actions, &last);
+        let last = self.before[self.before.len() - self.action_size..].to_vec();
+        shifted(&mut self.before, steps, self.action_size, &last);
     }
 }
 
-/// Climbs from the given sequences by Adam, within the bounds; the best of where they arrive, and of what was best on the
-/// way.
+/// Improves the given sequences by gradient ascent (Adam, projected onto the bounds). Returns the best of the sequences
+/// that they arrive at and of the best one on the way.
 pub(super) fn ascend(
     mut sequences: ActionSequences,
     config: &GradientConfig,
@@ -95,6 +102,7 @@ pub(super) fn ascend(
         }
         let mean: Vec<f64> = plan.actions.iter().map(|a| f64::from(*a)).collect();
         observer(&Iteration { index, candidates: &sequences, returns: &returns, mean: &mean });
+        // a <- clip(a + rate * Adam(clipped gradient))
         let corrections = [0.9_f64, 0.999].map(|beta| 1.0 - beta.powi(index as i32 + 1));
         for (row, gradient) in gradients.chunks_exact(width).enumerate() {
             let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
@@ -104,16 +112,15 @@ pub(super) fn ascend(
             let clip = (config.max_norm / norm.max(f64::MIN_POSITIVE)).min(1.0);
             for (i, g) in gradient.iter().enumerate() {
                 let g = clip * f64::from(*g);
-                let [first, second] = &mut moments[row * width + i];
-                *first += 0.1 * (g - *first);
-                *second += 0.001 * (g * g - *second);
-                let step = *first / corrections[0] / ((*second / corrections[1]).sqrt() + 1e-8);
+                let unbiased = |[m, v]: [f64; 2]| [m / corrections[0], v / corrections[1]];
+                let [m, v] = adam_step(g, moments[row * width + i].each_mut(), [0.1, 0.001], unbiased);
+                let step = m / (v.sqrt() + 1e-8);
                 let action = &mut sequences.values[row * width + i];
                 *action = (f64::from(*action) + config.rate * step).clamp(-1.0, 1.0) as f32;
             }
         }
     }
-    // What an objective differentiates need not be all that it judges by.
+    // What an objective differentiates need not be all that it measures: evaluate once more.
     sequences.values.extend(plan.actions);
     let returns = objective.returns(&sequences);
     let winner = best(&returns, 1)[0];

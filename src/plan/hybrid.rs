@@ -1,5 +1,6 @@
-//! iCEM finds the right valley, gradients its bottom: a few steps of ascent from the plan that iCEM found, kept only
-//! if a fresh evaluation agrees that it became better.
+//! A hybrid of zeroth-order and gradient search: iCEM searches globally, a few steps of gradient ascent refine its plan,
+//! and the refined plan is kept only if it is better when both are evaluated again, side by side. (In the spirit of
+//! Bharadhwaj et al. 2020, who take gradient steps on the samples of every CEM iteration.)
 
 use serde::{Deserialize, Serialize};
 
@@ -11,11 +12,11 @@ use crate::rng::Rng;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HybridConfig {
-    /// The search.
+    /// The global search.
     pub icem: IcemConfig,
-    /// Steps of ascent afterwards.
+    /// Steps of gradient ascent afterwards.
     pub iterations: usize,
-    /// Their size.
+    /// Step size of the ascent (Adam).
     pub rate: f64,
 }
 
@@ -25,19 +26,23 @@ impl Default for HybridConfig {
     }
 }
 
-/// The planner.
+/// iCEM, refined by gradient ascent.
+#[derive(Clone, Debug)]
 pub struct Hybrid {
     icem: Icem,
     ascent: GradientConfig,
-    actions: usize,
+    action_size: usize,
 }
 
 impl Hybrid {
-    /// For actions of so many numbers.
-    pub fn new(config: HybridConfig, actions: usize) -> Self {
+    /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If the horizon is shorter than 2.
+    pub fn new(config: HybridConfig, action_size: usize) -> Self {
         let HybridConfig { icem, iterations, rate } = config;
         let ascent = GradientConfig { horizon: icem.horizon, starts: 1, iterations, rate, ..GradientConfig::default() };
-        Self { icem: Icem::new(icem, actions), ascent, actions }
+        Self { icem: Icem::new(icem, action_size), ascent, action_size }
     }
 }
 
@@ -49,9 +54,9 @@ impl Planner for Hybrid {
     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let found = self.icem.plan(objective, observer, rng);
         let sequence =
-            |values: Vec<f32>| ActionSequences { horizon: self.ascent.horizon, actions: self.actions, values };
+            |values: Vec<f32>| ActionSequences { horizon: self.ascent.horizon, actions: self.action_size, values };
         let climbed = ascend(sequence(found.actions.clone()), &self.ascent, objective, observer);
-        // Both again, under the same luck.
+        // Both again in one batch, and so with common random numbers.
         let returns = objective.returns(&sequence([found.actions.clone(), climbed.actions.clone()].concat()));
         if returns[1] > returns[0] {
             self.icem.adopt(&climbed.actions);

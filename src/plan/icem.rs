@@ -1,39 +1,46 @@
-//! iCEM (Pinneri et al. 2020): the cross-entropy method with coloured noise, elites kept from iteration to
-//! iteration and from step to step, and a population that shrinks.
+//! iCEM (Pinneri et al. 2020, Algorithm 1): the cross-entropy method with
+//! - coloured noise of exponent beta along the horizon, clipped to the bounds,
+//! - elites that are kept from iteration to iteration, and shifted from plan to plan,
+//! - a population that decays: N_i = max(N_{i-1} / gamma, 2K),
+//! - the mean among the candidates of the last iteration, and the best candidate as the plan to execute.
 //!
-//! Deviations: elites kept within a plan are scored again with the others, since a model may answer with
-//! luck; and the plan that is executed is the best of the last iteration, in which the mean takes part.
+//! Deviations: kept elites are evaluated again with the other candidates, since the return that a stochastic model
+//! predicted for them may have been a favourable draw; a shifted elite repeats its last action instead of drawing a new
+//! one; `execute_mean` executes the mean, as PETS does.
 
 use serde::{Deserialize, Serialize};
 
+use super::cem::refit;
 use super::noise::ColoredNoise;
-use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, refit, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::Rng;
 
 /// Settings of [`Icem`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct IcemConfig {
-    /// Steps that it looks ahead.
+    /// The planning horizon, in actions.
     pub horizon: usize,
-    /// ActionSequences tried in the first iteration.
+    /// Fresh candidates in the first iteration.
     pub population: usize,
-    /// Each iteration tries so many times fewer than the one before, but twice the elites at least.
+    /// The factor gamma by which the population shrinks from iteration to iteration, down to twice the elites.
     pub decay: f64,
-    /// The best, which shape the next iteration.
+    /// The best candidates, to which the distribution is refitted.
     pub elites: usize,
     /// Iterations.
     pub iterations: usize,
-    /// Weight of the old mean and variance.
+    /// Weight of the old mean and variance in a refit.
     pub momentum: f64,
-    /// Exponent of the noise: 2 to 4 for slow arms, below 1 for fast legs.
+    /// Exponent beta of the noise ([`ColoredNoise`]): 2 to 4 for slow manipulation, below 1 for fast locomotion. 0 is white
+    /// noise.
     pub noise_beta: f64,
-    /// Standard deviation at the start of every plan.
+    /// Standard deviation of the search distribution at the start of every plan; actions span [-1, 1].
+    #[doc(alias = "standard deviation")]
     pub start_deviation: f64,
-    /// Share of the elites that is kept.
+    /// Share of the elites that is kept as candidates of the next iteration, and shifted to the next plan.
     pub kept: f64,
-    /// Executes the mean of the last distribution rather than the best sequence that was seen, which a model may
-    /// have flattered.
+    /// Executes the mean of the last distribution instead of the best candidate of the last iteration, whose predicted
+    /// return is the most likely one to be too high.
     pub execute_mean: bool,
 }
 
@@ -54,37 +61,45 @@ impl Default for IcemConfig {
     }
 }
 
-/// The planner.
+/// The improved cross-entropy method.
+#[doc(alias = "iCEM")]
+#[doc(alias = "cross-entropy method")]
+#[derive(Clone, Debug)]
 pub struct Icem {
     config: IcemConfig,
-    actions: usize,
+    action_size: usize,
     noise: ColoredNoise,
+    /// Mean of the search distribution, `[horizon, actions]`.
     mean: Vec<f64>,
-    /// Elites of the plan before, best first.
+    /// Elites of the last iteration, best first, each `[horizon, actions]`.
     elites: Vec<Vec<f32>>,
 }
 
 impl Icem {
-    /// For actions of so many numbers.
-    pub fn new(config: IcemConfig, actions: usize) -> Self {
+    /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If the horizon is shorter than 2.
+    pub fn new(config: IcemConfig, action_size: usize) -> Self {
         let noise = ColoredNoise::new(config.noise_beta, config.horizon);
-        Self { mean: vec![0.0; config.horizon * actions], elites: Vec::new(), noise, actions, config }
+        Self { mean: vec![0.0; config.horizon * action_size], elites: Vec::new(), noise, action_size, config }
     }
 
-    /// ActionSequences tried in each iteration.
+    /// Fresh candidates in each iteration: N_i = max(N_{i-1} / gamma, 2K).
     pub fn sizes(config: &IcemConfig) -> Vec<usize> {
         let next = |size: &usize| Some(((*size as f64 / config.decay) as usize).max(2 * config.elites));
         std::iter::successors(Some(config.population), next).take(config.iterations).collect()
     }
 
-    /// Takes a better plan for the best of its elites.
+    /// Puts a better plan before its elites.
     pub(super) fn adopt(&mut self, actions: &[f32]) {
         self.elites.insert(0, actions.to_vec());
         self.elites.truncate(self.config.elites);
     }
 
+    /// One candidate: clip(mean + deviation * coloured noise).
     fn sample(&self, variance: &[f64], rng: &mut Rng) -> Vec<f32> {
-        let noise = self.noise.sample_actions(self.actions, rng);
+        let noise = self.noise.sample_actions(self.action_size, rng);
         let noisy = self.mean.iter().zip(variance).zip(noise).map(|((m, v), noise)| m + v.sqrt() * noise);
         noisy.map(|a| a.clamp(-1.0, 1.0) as f32).collect()
     }
@@ -103,8 +118,8 @@ impl Planner for Icem {
         let mut plan = Plan { actions: Vec::new(), best_return: f32::NEG_INFINITY };
         let sizes = Self::sizes(&config);
         for (index, size) in sizes.iter().enumerate() {
-            // Sample: fresh noise, the best of before, and at last the mean itself.
-            let mut candidates = ActionSequences::new(config.horizon, self.actions);
+            // Sample: fresh candidates, the kept elites, and in the last iteration the mean.
+            let mut candidates = ActionSequences::new(config.horizon, self.action_size);
             for _ in 0..*size {
                 candidates.values.extend(self.sample(&variance, rng));
             }
@@ -112,9 +127,9 @@ impl Planner for Icem {
             if index + 1 == sizes.len() {
                 candidates.values.extend(self.mean.iter().map(|a| *a as f32));
             }
-            // Score.
+            // Evaluate.
             let returns = objective.returns(&candidates);
-            // Refit.
+            // Refit to the elites.
             let order = best(&returns, config.elites);
             self.elites = order.iter().map(|&i| candidates.row(i).to_vec()).collect();
             let elites: Vec<&[f32]> = self.elites.iter().map(Vec::as_slice).collect();
@@ -129,11 +144,11 @@ impl Planner for Icem {
     }
 
     fn shift(&mut self, steps: usize) {
-        let last = self.mean[self.mean.len() - self.actions..].to_vec();
-        shifted(&mut self.mean, steps, self.actions, &last);
+        let last = self.mean[self.mean.len() - self.action_size..].to_vec();
+        shifted(&mut self.mean, steps, self.action_size, &last);
         for elite in &mut self.elites {
-            let last = elite[elite.len() - self.actions..].to_vec();
-            shifted(elite, steps, self.actions, &last);
+            let last = elite[elite.len() - self.action_size..].to_vec();
+            shifted(elite, steps, self.action_size, &last);
         }
     }
 }

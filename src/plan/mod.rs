@@ -1,12 +1,43 @@
-//! Planning: finding a sequence of actions that maximises what a closure says of it.
+//! Planning: finding an action sequence that maximises an objective.
 //!
-//! A planner knows nothing of environments or models. It proposes sequences, is told what each is
-//! worth, and keeps what is worth keeping for the next time, when the world has moved on a step
-//! ([`Planner::shift`]). [`RecedingHorizon`] makes a controller of it. An observer may watch every iteration.
+//! A planner knows nothing of environments or models. It proposes action sequences, is told the return of each, and
+//! keeps what helps the next search, when the environment has moved on by a step ([`Planner::shift`]).
+//! [`RecedingHorizon`] turns a planner into a controller (model predictive control, MPC). An observer may watch every
+//! iteration. Actions lie in [-1, 1].
 //!
-//! Actions lie in [-1, 1].
+//! | planner | search |
+//! | --- | --- |
+//! | [`RandomShooting`] | the best of many uniform random sequences |
+//! | [`Cem`] | the cross-entropy method, as in PETS |
+//! | [`Icem`] | CEM with coloured noise and a memory |
+//! | [`Mppi`] | model predictive path integral control: an average of all samples, weighted by exp(return) |
+//! | [`Gradient`] | gradient ascent on the actions (gradient shooting) |
+//! | [`Hybrid`] | iCEM, refined by gradient ascent |
+//!
+//! ```
+//! use handful::plan::{ActionSequences, Icem, IcemConfig, Planner};
+//! use handful::rng;
+//!
+//! // Five time steps, two numbers in each action; the closer they all are to 0.5, the higher the return.
+//! let mut objective = |candidates: &ActionSequences| -> Vec<f32> {
+//!     candidates.rows().map(|row| -row.iter().map(|a| (a - 0.5).powi(2)).sum::<f32>()).collect()
+//! };
+//! let mut planner = Icem::new(IcemConfig { horizon: 5, iterations: 6, ..IcemConfig::default() }, 2);
+//! let mut best = Vec::new();
+//! let plan = planner.plan(
+//!     &mut objective,
+//!     &mut |iteration| best.push(iteration.returns.iter().copied().fold(f32::MIN, f32::max)),
+//!     &mut rng::stream(0, "example"),
+//! );
+//! assert_eq!(plan.actions.len(), 5 * 2);
+//! assert!(plan.best_return > best[0], "later iterations find better sequences");
+//! ```
+//!
+//! A planner of one's own implements [`Planner`]. It then enters everything that plans: [`RecedingHorizon`],
+//! [`Pets::with_planner`](crate::agent::Pets::with_planner), [`Oracle::with_planner`](crate::agent::Oracle::with_planner).
 
 mod cem;
+mod config;
 mod control;
 mod gradient;
 mod hybrid;
@@ -16,6 +47,7 @@ pub mod noise;
 mod shooting;
 
 pub use cem::{Cem, CemConfig};
+pub use config::PlannerConfig;
 pub use control::{ControlConfig, RecedingHorizon};
 pub use gradient::{Gradient, GradientConfig};
 pub use hybrid::{Hybrid, HybridConfig};
@@ -23,43 +55,44 @@ pub use icem::{Icem, IcemConfig};
 pub use mppi::{Mppi, MppiConfig};
 pub use shooting::{RandomShooting, ShootingConfig};
 
-use serde::{Deserialize, Serialize};
-
-use crate::error::{Error, Result};
 use crate::rng::Rng;
 
-/// A batch of action sequences, `[count, horizon, actions]`.
+/// A batch of action sequences, `[count, horizon, actions]`, all of one length.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActionSequences {
-    /// Steps in each.
+    /// Time steps in each sequence.
     pub horizon: usize,
     /// Numbers in an action.
     pub actions: usize,
-    /// All numbers, sequence after sequence, step after step.
+    /// All numbers, sequence after sequence, time step after time step.
     pub values: Vec<f32>,
 }
 
 impl ActionSequences {
-    /// None yet.
-    pub fn new(horizon: usize, actions: usize) -> Self {
-        Self { horizon, actions, values: Vec::new() }
+    /// An empty batch, for sequences of `horizon` actions of `action_size` numbers.
+    pub fn new(horizon: usize, action_size: usize) -> Self {
+        Self { horizon, actions: action_size, values: Vec::new() }
     }
 
-    /// How many there are.
+    /// The number of sequences.
     pub fn count(&self) -> usize {
         self.values.len() / self.width()
     }
 
-    /// One of them, `[horizon, actions]`.
+    /// The sequence `i`, `[horizon, actions]`.
+    ///
+    /// # Panics
+    /// If there is no such sequence.
     pub fn row(&self, i: usize) -> &[f32] {
         &self.values[i * self.width()..][..self.width()]
     }
 
-    /// All of them.
+    /// All sequences, each `[horizon, actions]`.
     pub fn rows(&self) -> impl Iterator<Item = &[f32]> {
         self.values.chunks_exact(self.width())
     }
 
+    /// Numbers in a sequence.
     fn width(&self) -> usize {
         self.horizon * self.actions
     }
@@ -67,11 +100,11 @@ impl ActionSequences {
 
 /// What a planner maximises. Any closure from sequences to returns is an objective.
 pub trait Objective {
-    /// What sequences are worth: one return for each. Not a number counts as worst.
+    /// The return of each sequence, `[count]`. NaN counts as the worst.
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32>;
 
-    /// Returns, and how they change with every number of every sequence (`[count, horizon, actions]`). Unless an
-    /// objective knows better, central differences: two more returns for each number.
+    /// Returns, `[count]`, and their gradients with respect to the actions, `[count, horizon, actions]`. The default takes
+    /// central differences, at the price of two more returns for each number; a differentiable objective overrides it.
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         const STEP: f32 = 1e-3;
         let width = sequences.width();
@@ -95,118 +128,125 @@ impl<F: FnMut(&ActionSequences) -> Vec<f32>> Objective for F {
     }
 }
 
-/// One iteration of a planner, for those who watch.
+/// One iteration of a planner, as an observer sees it.
+#[derive(Clone, Copy, Debug)]
 pub struct Iteration<'a> {
-    /// Its number, from 0.
+    /// Its index, from 0.
     pub index: usize,
-    /// What was tried.
+    /// The candidates.
     pub candidates: &'a ActionSequences,
-    /// What each was worth.
+    /// The return of each candidate.
     pub returns: &'a [f32],
-    /// The mean of the search distribution afterwards, `[horizon, actions]`.
+    /// The mean of the search distribution after the iteration, `[horizon, actions]`. For planners without a
+    /// distribution: the best sequence so far.
     pub mean: &'a [f64],
 }
 
-/// Watches iterations.
+/// Is called after every iteration of a planner. `&mut |_| {}` ignores them.
 pub type PlanObserver<'a> = dyn FnMut(&Iteration) + 'a;
 
-/// What a planner proposes.
+/// The result of a search.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
-    /// The sequence, `[horizon, actions]`.
+    /// The sequence to execute, `[horizon, actions]`.
     pub actions: Vec<f32>,
-    /// The best return that was seen on the way: what the objective promises, rather too much than too
-    /// little.
+    /// The best return among the candidates. A maximum over estimates is biased upwards, and the sequence to execute
+    /// need not be the one that it belongs to: some planners execute a mean.
     pub best_return: f32,
 }
 
-/// A planner with its memory from step to step.
+/// A search over action sequences, with what it keeps from one time step to the next (a warm start).
+///
+/// A planner of one's own, which improves on one sequence by trying random changes:
+///
+/// ```
+/// use handful::plan::{ActionSequences, ControlConfig, Iteration, Objective, Plan, PlanObserver, Planner, RecedingHorizon};
+/// use handful::rng::{self, Rng};
+///
+/// struct HillClimber { sequence: Vec<f32>, action_size: usize }
+///
+/// impl Planner for HillClimber {
+///     fn reset(&mut self) {
+///         self.sequence.fill(0.0);
+///     }
+///
+///     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
+///         let horizon = self.sequence.len() / self.action_size;
+///         let mut best_return = f32::NEG_INFINITY;
+///         for index in 0..50 {
+///             let mut candidates = ActionSequences::new(horizon, self.action_size);
+///             candidates.values.extend(&self.sequence);
+///             let changed = self.sequence.iter().map(|a| (a + 0.2 * rng::normal(rng) as f32).clamp(-1.0, 1.0));
+///             candidates.values.extend(changed);
+///             let returns = objective.returns(&candidates);
+///             let winner = usize::from(returns[1] > returns[0]);
+///             self.sequence = candidates.row(winner).to_vec();
+///             best_return = returns[winner];
+///             let mean: Vec<f64> = self.sequence.iter().map(|a| f64::from(*a)).collect();
+///             observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &mean });
+///         }
+///         Plan { actions: self.sequence.clone(), best_return }
+///     }
+///
+///     fn shift(&mut self, steps: usize) {
+///         self.sequence.rotate_left(steps * self.action_size);
+///     }
+/// }
+///
+/// let planner = HillClimber { sequence: vec![0.0; 4], action_size: 1 };
+/// let mut controller = RecedingHorizon::new(Box::new(planner), 1, &ControlConfig::default());
+/// let mut right = |c: &ActionSequences| -> Vec<f32> { c.rows().map(|row| row.iter().sum()).collect() };
+/// let action = controller.act(&mut right, &mut |_| {}, &mut rng::stream(0, "example"));
+/// assert!(action[0] > 0.5);
+/// ```
 pub trait Planner: Send {
-    /// Forgets everything: a new episode.
+    /// Forgets everything: a new episode begins.
     fn reset(&mut self);
 
-    /// Searches for the best sequence.
+    /// Searches for the sequence with the highest return. Calls `observer` after every iteration.
     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan;
 
-    /// The first `steps` actions of the plan were executed: the memory moves on with the world.
+    /// The first `steps` actions of the plan were executed: what is kept moves on by as many time steps, so that the next
+    /// search starts from the rest of this plan (a warm start).
     fn shift(&mut self, steps: usize);
 }
 
-/// Makes planners: a [`PlannerConfig`], or a closure from the numbers of an action to a planner.
+impl<P: Planner + ?Sized> Planner for Box<P> {
+    fn reset(&mut self) {
+        (**self).reset();
+    }
+
+    fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
+        (**self).plan(objective, observer, rng)
+    }
+
+    fn shift(&mut self, steps: usize) {
+        (**self).shift(steps);
+    }
+}
+
+/// Makes planners, one for each environment that is planned in: a [`PlannerConfig`], or any closure from the numbers in
+/// an action to a planner.
+///
+/// ```
+/// use handful::plan::{Cem, CemConfig, MakePlanner, PlannerConfig};
+///
+/// let by_name: &dyn MakePlanner = &PlannerConfig::Cem(CemConfig::default());
+/// let by_closure: &dyn MakePlanner = &|action_size| Cem::new(CemConfig::default(), action_size);
+/// let planners = [by_name.make(3), by_closure.make(3)];
+/// ```
 pub trait MakePlanner: Send + Sync {
     /// A planner for actions of `action_size` numbers.
     fn make(&self, action_size: usize) -> Box<dyn Planner>;
 }
 
-impl MakePlanner for PlannerConfig {
+impl<F, P> MakePlanner for F
+where
+    F: Fn(usize) -> P + Send + Sync,
+    P: Planner + 'static,
+{
     fn make(&self, action_size: usize) -> Box<dyn Planner> {
-        self.build(action_size)
-    }
-}
-
-/// A planner with its settings.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum PlannerConfig {
-    /// Random shooting.
-    Shooting(ShootingConfig),
-    /// The cross-entropy method as in PETS.
-    Cem(CemConfig),
-    /// Its improved form.
-    Icem(IcemConfig),
-    /// Model-predictive path integrals.
-    Mppi(MppiConfig),
-    /// Gradient ascent from several starts.
-    Gradient(GradientConfig),
-    /// iCEM, then gradient ascent from what it found.
-    Hybrid(HybridConfig),
-}
-
-impl PlannerConfig {
-    /// A planner for actions of so many numbers.
-    pub fn build(&self, actions: usize) -> Box<dyn Planner> {
-        match self {
-            PlannerConfig::Shooting(config) => Box::new(RandomShooting::new(config.clone(), actions)),
-            PlannerConfig::Cem(config) => Box::new(Cem::new(config.clone(), actions)),
-            PlannerConfig::Icem(config) => Box::new(Icem::new(config.clone(), actions)),
-            PlannerConfig::Mppi(config) => Box::new(Mppi::new(config.clone(), actions)),
-            PlannerConfig::Gradient(config) => Box::new(Gradient::new(config.clone(), actions)),
-            PlannerConfig::Hybrid(config) => Box::new(Hybrid::new(config.clone(), actions)),
-        }
-    }
-
-    /// Steps that it looks ahead.
-    pub fn horizon(&self) -> usize {
-        match self {
-            PlannerConfig::Shooting(config) => config.horizon,
-            PlannerConfig::Cem(config) => config.horizon,
-            PlannerConfig::Icem(config) => config.horizon,
-            PlannerConfig::Mppi(config) => config.horizon,
-            PlannerConfig::Gradient(config) => config.horizon,
-            PlannerConfig::Hybrid(config) => config.icem.horizon,
-        }
-    }
-
-    /// # Errors
-    /// If the horizon is shorter than two steps, or nothing would be tried.
-    pub(crate) fn check(&self) -> Result<()> {
-        let tried = match self {
-            PlannerConfig::Shooting(config) => config.population,
-            PlannerConfig::Cem(config) => config.population.min(config.elites).min(config.iterations),
-            PlannerConfig::Icem(config) => config.population.min(config.elites).min(config.iterations),
-            PlannerConfig::Mppi(config) => config.population.min(config.iterations),
-            PlannerConfig::Gradient(config) => config.starts,
-            PlannerConfig::Hybrid(HybridConfig { icem, .. }) => icem.population.min(icem.elites).min(icem.iterations),
-        };
-        if self.horizon() < 2 {
-            return Err(Error::BadSetting("planner: `horizon` must be at least 2".into()));
-        }
-        if tried == 0 {
-            return Err(Error::BadSetting(
-                "planner: population, elites, iterations, starts: at least 1 of each".into(),
-            ));
-        }
-        Ok(())
+        Box::new(self(action_size))
     }
 }
 
@@ -221,26 +261,15 @@ fn best(returns: &[f32], count: usize) -> Vec<usize> {
     order
 }
 
-/// Moves mean and variance to those of the elites: `new = momentum old + (1 - momentum) elites`, with
-/// the population variance.
-fn refit(mean: &mut [f64], variance: &mut [f64], elites: &[&[f32]], momentum: f64) {
-    let n = elites.len() as f64;
-    for (i, (mean, variance)) in mean.iter_mut().zip(variance).enumerate() {
-        let centre = elites.iter().map(|row| f64::from(row[i])).sum::<f64>() / n;
-        let spread = elites.iter().map(|row| (f64::from(row[i]) - centre).powi(2)).sum::<f64>() / n;
-        *mean = momentum * *mean + (1.0 - momentum) * centre;
-        *variance = momentum * *variance + (1.0 - momentum) * spread;
-    }
-}
-
-/// Drops the first `steps` actions of a sequence and repeats `last` at its end.
-fn shifted<T: Copy>(sequence: &mut Vec<T>, steps: usize, actions: usize, last: &[T]) {
+/// Drops the first `steps` actions of a sequence, and appends `last` as many times.
+fn shifted<T: Copy>(sequence: &mut Vec<T>, steps: usize, action_size: usize, last: &[T]) {
     for _ in 0..steps {
-        sequence.drain(..actions);
+        sequence.drain(..action_size);
         sequence.extend_from_slice(last);
     }
 }
 
+/// The mean of a search distribution as actions within the bounds.
 fn as_actions(mean: &[f64]) -> Vec<f32> {
     mean.iter().map(|a| a.clamp(-1.0, 1.0) as f32).collect()
 }
@@ -248,18 +277,6 @@ fn as_actions(mean: &[f64]) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn elites_are_refitted_with_momentum() {
-        let elites: [&[f32]; 3] = [&[0.2, -0.4], &[0.6, 0.0], &[0.4, 0.1]];
-        let (mut mean, mut variance) = ([0.0, 0.0], [0.25, 0.25]);
-        refit(&mut mean, &mut variance, &elites, 0.1);
-        let near = |a: f64, b: f64| assert!((a - b).abs() < 1e-7, "{a}, expected {b}");
-        near(mean[0], 0.36);
-        near(mean[1], -0.09);
-        near(variance[0], 0.049);
-        near(variance[1], 0.067);
-    }
 
     #[test]
     fn the_best_come_first_and_no_number_comes_last() {

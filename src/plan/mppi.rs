@@ -1,5 +1,10 @@
-//! Model-predictive path integrals (Williams et al. 2015), in the filtered form of PDDM (Nagabandi et al. 2019):
-//! every sample counts, the better the more, and noise is smoothed along the horizon.
+//! Model predictive path integral control (MPPI; Williams et al. 2017, Algorithm 2) in the form of PDDM (Nagabandi et
+//! al. 2019, "Filtering and Reward-Weighted Refinement"): the new mean is the average of all samples, weighted by the
+//! exponential of their returns, and the samples are low-pass filtered along the horizon.
+//!
+//! Deviations: several iterations for each plan; the temperature is relative to the standard deviation of the returns;
+//! MPPI's term for the control cost of the noise is left out, as in PDDM; and the filter runs over mean plus noise,
+//! starting from the action executed last, as in the PDDM authors' code (the paper filters the noise alone).
 
 use serde::{Deserialize, Serialize};
 
@@ -10,18 +15,19 @@ use crate::rng::{self, Rng};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MppiConfig {
-    /// Steps that it looks ahead.
+    /// The planning horizon, in actions.
     pub horizon: usize,
-    /// ActionSequences tried in an iteration.
+    /// Candidates in an iteration.
     pub population: usize,
     /// Iterations.
     pub iterations: usize,
-    /// Standard deviation of the noise.
+    /// Standard deviation of the noise; it does not shrink.
+    #[doc(alias = "standard deviation")]
     pub deviation: f64,
-    /// Weight of an action against the one before it; 1 does not smooth.
+    /// Weight (PDDM's beta) of a sampled action against the action before it; 1 does not smooth.
     pub smoothing: f64,
-    /// How much return makes a sample count e times more, as a share of the spread (standard deviation) of all
-    /// returns: the scale of rewards does not matter.
+    /// The temperature lambda, in standard deviations of the candidates' returns, so that the scale of rewards does not
+    /// matter. PDDM's gamma is its inverse.
     pub temperature: f64,
 }
 
@@ -31,27 +37,33 @@ impl Default for MppiConfig {
     }
 }
 
-/// The planner.
+/// Model predictive path integral control.
+#[doc(alias = "MPPI")]
+#[doc(alias = "PDDM")]
+#[doc(alias = "model predictive path integral")]
+#[derive(Clone, Debug)]
 pub struct Mppi {
     config: MppiConfig,
-    actions: usize,
+    action_size: usize,
+    /// `[horizon, actions]`.
     mean: Vec<f64>,
     /// The action executed last.
     before: Vec<f64>,
 }
 
 impl Mppi {
-    /// For actions of so many numbers.
-    pub fn new(config: MppiConfig, actions: usize) -> Self {
-        Self { mean: vec![0.0; config.horizon * actions], before: vec![0.0; actions], actions, config }
+    /// A planner for actions of `action_size` numbers.
+    pub fn new(config: MppiConfig, action_size: usize) -> Self {
+        Self { mean: vec![0.0; config.horizon * action_size], before: vec![0.0; action_size], action_size, config }
     }
 
+    /// One candidate, low-pass filtered along the horizon: a_t = beta (mean_t + noise_t) + (1 - beta) a_{t-1}.
     fn sample(&self, rng: &mut Rng) -> Vec<f32> {
         let MppiConfig { deviation, smoothing, .. } = self.config;
         let mut before = self.before.clone();
         let mut sequence = Vec::with_capacity(self.mean.len());
         for (i, mean) in self.mean.iter().enumerate() {
-            let before = &mut before[i % self.actions];
+            let before = &mut before[i % self.action_size];
             let noisy = mean + deviation * rng::normal(rng);
             *before = (smoothing * noisy + (1.0 - smoothing) * *before).clamp(-1.0, 1.0);
             sequence.push(*before as f32);
@@ -69,13 +81,16 @@ impl Planner for Mppi {
     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
         let mut best_return = f32::NEG_INFINITY;
         for index in 0..self.config.iterations {
-            let mut candidates = ActionSequences::new(self.config.horizon, self.actions);
+            // Sample.
+            let mut candidates = ActionSequences::new(self.config.horizon, self.action_size);
             for _ in 0..self.config.population {
                 candidates.values.extend(self.sample(rng));
             }
+            // Evaluate.
             let returns = objective.returns(&candidates);
             best_return = returns.iter().copied().fold(best_return, f32::max);
-            let weights = weights(&returns, self.config.temperature * spread(&returns));
+            // The reward-weighted mean of all candidates.
+            let weights = weights(&returns, self.config.temperature * standard_deviation(&returns));
             self.mean.fill(0.0);
             for (row, weight) in candidates.rows().zip(&weights) {
                 self.mean.iter_mut().zip(row).for_each(|(m, a)| *m += weight * f64::from(*a));
@@ -86,14 +101,15 @@ impl Planner for Mppi {
     }
 
     fn shift(&mut self, steps: usize) {
-        let executed = (steps.max(1) - 1) * self.actions;
-        self.before = self.mean[executed..executed + self.actions].to_vec();
-        let last = self.mean[self.mean.len() - self.actions..].to_vec();
-        shifted(&mut self.mean, steps, self.actions, &last);
+        let executed = (steps.max(1) - 1) * self.action_size;
+        self.before = self.mean[executed..executed + self.action_size].to_vec();
+        let last = self.mean[self.mean.len() - self.action_size..].to_vec();
+        shifted(&mut self.mean, steps, self.action_size, &last);
     }
 }
 
-/// Weights proportional to exp(return / temperature), summing to one. Not a number weighs nothing.
+/// The weights of MPPI, `[candidates]`: w_i = exp((R_i - max R) / temperature), divided by their sum. A return of NaN
+/// weighs nothing.
 fn weights(returns: &[f32], temperature: f64) -> Vec<f64> {
     let top = returns.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     let weigh = |r: &f32| if r.is_nan() { 0.0 } else { (f64::from(r - top) / temperature).exp() };
@@ -102,8 +118,8 @@ fn weights(returns: &[f32], temperature: f64) -> Vec<f64> {
     weights.iter().map(|w| w / sum).collect()
 }
 
-/// The standard deviation of the returns that are numbers; a little above zero if all are equal.
-fn spread(returns: &[f32]) -> f64 {
+/// The standard deviation of the finite returns; a little above zero if all are equal.
+fn standard_deviation(returns: &[f32]) -> f64 {
     let known: Vec<f64> = returns.iter().filter(|r| r.is_finite()).map(|r| f64::from(*r)).collect();
     let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
     let variance = known.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / known.len().max(1) as f64;

@@ -1,24 +1,42 @@
-//! Coloured noise (Timmer and Koenig 1995): random sequences whose power falls with frequency as
-//! f^-beta. Beta 0 is white; the larger beta, the slower the sequence, and the farther an arm gets with it.
+//! Coloured noise (Timmer and Koenig 1995; for planning, Pinneri et al. 2020, section 3.1): random sequences whose power
+//! spectral density falls with frequency f as f^-beta. Beta 0 is white noise, 1 pink, 2 red (Brownian); the larger beta,
+//! the more successive actions agree, and the further an arm gets with them.
+//!
+//! ```
+//! use handful::plan::noise::ColoredNoise;
+//! use handful::rng;
+//!
+//! // How much successive time steps differ.
+//! let roughness = |beta: f64| -> f64 {
+//!     let sequence = ColoredNoise::new(beta, 100).sample(&mut rng::stream(0, "example"));
+//!     sequence.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum()
+//! };
+//! assert!(roughness(2.0) < 0.2 * roughness(0.0));
+//! ```
 
 use std::f64::consts::TAU;
 
 use crate::rng::{self, Rng};
 
-/// Draws sequences of one length and colour.
+/// Samples noise of one exponent over one length.
+#[doc(alias = "colored noise")]
+#[doc(alias = "pink noise")]
 #[derive(Clone, Debug)]
 pub struct ColoredNoise {
     length: usize,
     /// Standard deviation of each Fourier coefficient, from frequency zero up.
     scales: Vec<f64>,
-    /// What the inverse transform is divided by.
+    /// The standard deviation of what the inverse transform gives (without its constant part); it is divided out.
     sigma: f64,
 }
 
 impl ColoredNoise {
-    /// Noise of exponent `beta` over `length` steps (at least 2).
+    /// Noise of exponent `beta` over `length` time steps.
+    ///
+    /// # Panics
+    /// If `length` is less than 2.
     pub fn new(beta: f64, length: usize) -> Self {
-        assert!(length >= 2, "a sequence has at least two steps");
+        assert!(length >= 2, "a sequence has at least two time steps");
         let n = length as f64;
         let bins = length / 2 + 1;
         let scale = |k: usize| (k.max(1) as f64 / n).powf(-beta / 2.0);
@@ -31,7 +49,8 @@ impl ColoredNoise {
         Self { length, scales, sigma }
     }
 
-    /// One sequence, of mean zero and variance about one.
+    /// One sequence, `[length]`, of mean 0 and standard deviation about 1 (a little above for large beta: the constant part
+    /// is not counted in the normalisation, as in the reference).
     pub fn sample(&self, rng: &mut Rng) -> Vec<f64> {
         let n = self.length;
         let nyquist = n.is_multiple_of(2).then_some(n / 2);
@@ -44,7 +63,7 @@ impl ColoredNoise {
                 (real, if k == 0 || Some(k) == nyquist { 0.0 } else { imaginary })
             })
             .collect();
-        // The inverse of a real transform, summed as it stands: horizons are short.
+        // The inverse real Fourier transform, summed directly: horizons are short.
         (0..n)
             .map(|t| {
                 let terms = coefficients.iter().enumerate().map(|(k, (real, imaginary))| {
@@ -57,9 +76,9 @@ impl ColoredNoise {
             .collect()
     }
 
-    /// One sequence for each number of an action, side by side: `[length, actions]`.
-    pub fn sample_actions(&self, actions: usize, rng: &mut Rng) -> Vec<f64> {
-        let columns: Vec<Vec<f64>> = (0..actions).map(|_| self.sample(rng)).collect();
+    /// An independent sequence for each number of an action: `[length, actions]`.
+    pub fn sample_actions(&self, action_size: usize, rng: &mut Rng) -> Vec<f64> {
+        let columns: Vec<Vec<f64>> = (0..action_size).map(|_| self.sample(rng)).collect();
         (0..self.length).flat_map(|t| columns.iter().map(move |column| column[t])).collect()
     }
 }

@@ -1,4 +1,4 @@
-//! Random shooting: the best of many uniform random sequences.
+//! Random shooting: the best of many uniform random sequences (as in Nagabandi et al. 2018, section IV.C).
 
 use serde::{Deserialize, Serialize};
 
@@ -9,9 +9,9 @@ use crate::rng::{self, Rng};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ShootingConfig {
-    /// Steps that it looks ahead.
+    /// The planning horizon, in actions.
     pub horizon: usize,
-    /// ActionSequences tried.
+    /// Candidates.
     pub population: usize,
 }
 
@@ -21,16 +21,18 @@ impl Default for ShootingConfig {
     }
 }
 
-/// The planner that everything else has to beat. It remembers nothing.
+/// Random shooting: the baseline of planners. It keeps nothing from one plan to the next.
+#[doc(alias = "random shooting")]
+#[derive(Clone, Debug)]
 pub struct RandomShooting {
     config: ShootingConfig,
-    actions: usize,
+    action_size: usize,
 }
 
 impl RandomShooting {
-    /// For actions of so many numbers.
-    pub fn new(config: ShootingConfig, actions: usize) -> Self {
-        Self { config, actions }
+    /// A planner for actions of `action_size` numbers.
+    pub fn new(config: ShootingConfig, action_size: usize) -> Self {
+        Self { config, action_size }
     }
 }
 
@@ -38,7 +40,7 @@ impl Planner for RandomShooting {
     fn reset(&mut self) {}
 
     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
-        let mut candidates = ActionSequences::new(self.config.horizon, self.actions);
+        let mut candidates = ActionSequences::new(self.config.horizon, self.action_size);
         let count = self.config.population * candidates.width();
         candidates.values = (0..count).map(|_| rng::uniform(rng, -1.0, 1.0) as f32).collect();
         let returns = objective.returns(&candidates);

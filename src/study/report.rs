@@ -1,4 +1,4 @@
-//! The written report of a study, from its tables alone.
+//! The report of a study, written from its tables alone.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -8,11 +8,11 @@ use super::{figures, tables};
 use crate::error::Result;
 use crate::files;
 
-/// Reads a study's tables in `from`, and writes `summary.csv`, figures and `report.md` into `to`. Returns the table of
-/// results as text.
+/// Reads a study's tables from the folder `from`, and writes `summary.csv`, the figures and `report.md` into the folder
+/// `to`. Returns the table of results as text.
 ///
 /// # Errors
-/// If a table is missing or damaged, or a file cannot be written.
+/// If a table is missing or damaged, or if a file cannot be written.
 pub fn write(from: &Path, to: &Path) -> Result<String> {
     let tables = Tables::read(from)?;
     tables.write_summary(to)?;
@@ -20,18 +20,18 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     let mut tasks: Vec<&str> = pairs.iter().map(|(task, _)| task.as_str()).collect();
     tasks.dedup();
     let mut text = String::from("# Comparison\n\n");
-    text += "Every number here comes from `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` beside this page. ";
+    text += "Every number on this page comes from `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` in the same folder. ";
     text += "All methods are evaluated in the same way: the same tasks, observations and initial states, deterministic actions, ";
     text += "and every environment step counted, including the random warm-up. ";
-    text += "They differ in what they are given: `oracle` plans on the true simulator, `pets` in a learned model but with the ";
-    text += "known reward function of the observations; `dreamer` and `sac` only receive rewards.\n\n";
+    text += "They are not given the same information: `oracle` plans in the true simulator; `pets` plans in a learned model, but ";
+    text += "is given the reward function; `dreamer` and `sac` have only the rewards that they receive.\n\n";
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(
-        "\nSuccess: share of test episodes in which the task is fulfilled at the last step (success rate), with its 95 % \
-         Wilson interval. Steps to {:.0} %: median over the seeds of the environment steps after which the success rate \
-         first reaches that level, linear between two evaluations (a dash: it does not). SPARC, LDLJ: smoothness of the \
-         hand's movement; nearer to zero is smoother.\n",
+        "\nSuccess: share of test episodes in which the task is solved at the last step, with its 95 % Wilson interval. Steps to \
+         {:.0} %: environment steps at which the success curve, interpolated linearly between evaluations, first reaches \
+         that level; median over seeds (a dash if the median seed does not reach it). SPARC, LDLJ: smoothness of the \
+         hand's movement; closer to zero is smoother.\n",
         100.0 * LEVEL
     );
     for task in &tasks {
@@ -43,7 +43,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
                 .expect("text grows");
         }
         figures::tests(&tables, task, &to.join(&tests))?;
-        write!(text, "\n![Success rate and smoothness of each method on {task} in the test]({tests})\n")
+        write!(text, "\n![Success rate and smoothness of each method on {task} in the final test]({tests})\n")
             .expect("text grows");
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
             let file = format!("{task}-{method}-model.svg");
@@ -56,12 +56,12 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
             }
             let file = format!("{task}-{method}-values.svg");
             if figures::values(&tables, task, method, &to.join(&file))? {
-                write!(text, "\n![Value that {method} estimates on {task} over environment steps, and the return that followed]({file})\n")
+                write!(text, "\n![Value estimated by {method} on {task} over environment steps, and the return that followed]({file})\n")
                     .expect("text grows");
             }
         }
     }
-    text += "\n## How sure is this?\n\n";
+    text += "\n## How certain is this?\n\n";
     text += &caveat(&tables, &pairs)?;
     files::write(&to.join("report.md"), text.as_bytes())?;
     Ok(text_table(&rows(&tables)?))
@@ -110,7 +110,7 @@ fn text_table(rows: &[[String; 9]]) -> String {
     table.to_string()
 }
 
-/// The results of each method in a sentence.
+/// The results of a task in words.
 fn findings(tables: &Tables, task: &str) -> Result<String> {
     let mut text = String::new();
     for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
@@ -119,8 +119,8 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
         match (value("steps")?, value("steps_to_80")?, value("seeds_reaching_80")?, value("seeds")?) {
             (Some(budget), Some(steps), Some(reaching), Some(seeds)) => writeln!(
                 text,
-                "- `{method}` reaches {:.0} % success after {steps:.0} steps (median; {reaching:.0} of {seeds:.0} seeds get \
-                 there within {budget:.0}) and ends at {success:.0} %.",
+                "- `{method}` reaches {:.0} % success after {steps:.0} steps (median; {reaching:.0} of {seeds:.0} seeds reach \
+                 it within {budget:.0}) and ends at {success:.0} %.",
                 100.0 * tables::LEVEL
             ),
             (Some(budget), None, Some(reaching), Some(seeds)) => writeln!(
@@ -129,7 +129,7 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
                  {seeds:.0} seeds do); it ends at {success:.0} %.",
                 100.0 * tables::LEVEL
             ),
-            _ => writeln!(text, "- `{method}` does not learn; it succeeds in {success:.0} % of the episodes."),
+            _ => writeln!(text, "- `{method}` does not learn; it succeeds in {success:.0} % of the test episodes."),
         }
         .expect("text grows");
     }
@@ -144,15 +144,15 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
         }
     }
     Ok(match fewest {
-        f64::INFINITY => "No method here learns, so the only uncertainty is that of the test itself.\n".into(),
+        f64::INFINITY => "No method here learns, so the only uncertainty is that of the test episodes.\n".into(),
         n if n < 5.0 => format!(
-            "Not very: with {n:.0} seed{} of a learning method, the intervals say how well these trained agents do, not how \
-             the method does. Run `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
+            "Not very: with {n:.0} seed{} of a learning method, the intervals describe these particular agents, not the \
+             method. Run `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
             if n == 1.0 { "" } else { "s" }
         ),
         n => format!(
-            "Each learning method has {n:.0} seeds or more. `summary.csv` has the interquartile mean over the seeds with its \
-             bootstrap interval (`success_iqm_low`, `success_iqm_high`); trust differences that are larger than it.\n"
+            "Each learning method has at least {n:.0} seeds. `summary.csv` contains the interquartile mean over seeds with its \
+             bootstrap interval (`success_iqm_low`, `success_iqm_high`); trust only differences larger than this interval.\n"
         ),
     })
 }

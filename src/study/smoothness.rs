@@ -17,11 +17,11 @@
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex;
 
-/// Speeds below this fraction of the top speed are rest.
+/// Speeds below this fraction of the top speed count as rest.
 const REST: f64 = 0.05;
-/// SPARC looks at frequencies up to this, Hz (and never beyond half the sampling rate).
+/// SPARC uses frequencies up to this, in Hz (and never beyond half the sampling rate),
 const CUT_OFF: f64 = 10.0;
-/// ... and from the first to the last of them whose magnitude is at least this part of the largest.
+/// from the first to the last of them whose magnitude is at least this fraction of the largest.
 const THRESHOLD: f64 = 0.05;
 
 /// Smoothness of a path of hand positions (m) sampled every `dt` seconds: [`sparc`] and [`ldlj`], both dimensionless,

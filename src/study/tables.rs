@@ -1,6 +1,6 @@
-//! From the folders of runs to the tables of a study: `evaluations.csv`, `models.csv`, `values.csv` and `tests.csv` hold
-//! every run's numbers. What follows from them (`summary.csv`, a row for each task and method; figures; report) is made
-//! from these files alone.
+//! The tables of a study. `evaluations.csv`, `models.csv`, `values.csv` and `tests.csv` collect the numbers of all runs.
+//! Everything else (`summary.csv` with one row per task and method, the figures, the report) is computed from these files
+//! alone.
 
 use std::path::Path;
 
@@ -12,31 +12,31 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::rng;
 
-/// The success rate that counts as reached in the column `steps_to_80`.
+/// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
 
-/// Environment steps and the value at each, for one seed.
+/// The curve of one seed: environment steps, and the value at each of them.
 pub type Curve = (Vec<f64>, Vec<f64>);
 
 /// The tables of a study.
 #[derive(Clone, Debug)]
 pub struct Tables {
-    /// task, method, seed, step, success, ...: every evaluation of every learning run.
+    /// task, method, seed, step, success, ...: one row per evaluation of each learning run.
     pub evaluations: DataFrame,
-    /// task, method, seed, step, horizon, rmse, ...: the open-loop prediction error of every learned model in each
-    /// evaluation.
+    /// task, method, seed, step, horizon, rmse, ...: the open-loop prediction error of each learned model on
+    /// the episodes of each evaluation.
     pub models: DataFrame,
-    /// task, method, seed, step, expected, realised, ...: the value that every agent estimated in each evaluation, and the
-    /// discounted return that followed.
+    /// task, method, seed, step, expected, realised, ...: the estimated value in each
+    /// evaluation, and the discounted return that followed.
     pub values: DataFrame,
-    /// task, method, seed, episode, return, success, ...: every test episode.
+    /// task, method, seed, episode, return, success, ...: one row per test episode.
     pub tests: DataFrame,
-    /// One row for each task and method: what follows from the others.
+    /// One row per task and method, computed from the other tables.
     pub summary: DataFrame,
 }
 
 impl Tables {
-    /// Gathers the tables from the folders of runs.
+    /// Collects the tables from the folders of runs.
     ///
     /// # Errors
     /// If a run's files are missing or damaged.
@@ -94,7 +94,7 @@ impl Tables {
         Ok(Self { evaluations, models, values, tests, summary })
     }
 
-    /// Writes what was gathered into a study's folder.
+    /// Writes the collected tables into a study's folder.
     ///
     /// # Errors
     /// If a file cannot be written.
@@ -119,7 +119,7 @@ impl Tables {
         Ok(rows("task")?.into_iter().zip(rows("method")?).collect())
     }
 
-    /// The success curves of a method, one for each seed.
+    /// The success curves of a method: for each seed, steps and success rates.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -127,7 +127,7 @@ impl Tables {
         curves(&self.evaluations, task, method, "success").map_err(inside)
     }
 
-    /// A column of `models.csv` over environment steps, `horizon` steps ahead: one curve for each seed. Empty for methods
+    /// A column of `models.csv` over environment steps, for one horizon: for each seed, steps and values. Empty for methods
     /// without a model.
     ///
     /// # Errors
@@ -143,8 +143,8 @@ impl Tables {
         found().map_err(inside)
     }
 
-    /// A column of `values.csv` over environment steps: one curve for each seed. Empty for methods that
-    /// estimate no value.
+    /// A column of `values.csv` over environment steps: for each seed, steps and values. Empty for methods that estimate
+    /// no value.
     ///
     /// # Errors
     /// If the table lacks the column.
@@ -152,7 +152,7 @@ impl Tables {
         curves(&self.values, task, method, column).map_err(inside)
     }
 
-    /// A number of the summary, if the task and method have one in this column.
+    /// An entry of the summary; `None` if the entry is empty.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -186,7 +186,7 @@ fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFra
         let reached: Vec<f64> = curves.iter().filter_map(|(x, y)| steps_to(LEVEL, x, y)).collect();
         let areas: Vec<f64> = curves.iter().map(|(x, y)| area_under_curve(x, y)).collect();
         let budget = curves.iter().filter_map(|(x, _)| x.last().copied()).reduce(f64::max);
-        // The median over all seeds; a seed that never gets there counts as infinitely many steps.
+        // The median over all seeds; a seed that never reaches the level counts as infinitely many steps.
         let median = (!curves.is_empty()).then(|| median_with_missing(&reached, curves.len())).flatten();
         let values = [
             Some(by_seed.len() as f64),
@@ -232,7 +232,7 @@ const SUMMARY: [&str; 16] = [
     "smoothness_ldlj",
 ];
 
-/// The median of `n` values of which only the smaller ones are known; `None` if it is not among them.
+/// The median of `n` values of which only the smallest are known; `None` if the median is not among these.
 fn median_with_missing(known: &[f64], n: usize) -> Option<f64> {
     let mut sorted = known.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -248,14 +248,13 @@ fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
     frame.clone().lazy().filter(here).collect()
 }
 
-/// One row for each run, in the order in which the runs were carried out: these columns of its rows, as lists of the
-/// numbers that they hold.
+/// Groups rows by run: one row per run, in the order of the runs, with each of these columns as a list.
 fn by_run(rows: LazyFrame, columns: &[&str]) -> PolarsResult<DataFrame> {
     let lists: Vec<Expr> = columns.iter().map(|name| col(*name).strict_cast(DataType::Float64).drop_nulls()).collect();
     rows.group_by_stable(["task", "method", "seed"].map(col)).agg(lists).collect()
 }
 
-/// A column over steps, for each seed.
+/// A column over environment steps, for each seed.
 fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
     if rows.width() == 0 {
         return Ok(Vec::new());
@@ -286,7 +285,7 @@ fn read(path: &Path) -> Result<DataFrame> {
     }
     let reader = CsvReadOptions::default().with_infer_schema_length(None);
     let reader = reader.into_reader_with_file_handle(std::io::Cursor::new(bytes));
-    reader.finish().map_err(|problem| Error::bad_file(path, format!("no table of ours ({problem})")))
+    reader.finish().map_err(|problem| Error::bad_file(path, format!("not a table of a study ({problem})")))
 }
 
 fn write(path: &Path, table: &DataFrame) -> Result<()> {
@@ -297,7 +296,7 @@ fn write(path: &Path, table: &DataFrame) -> Result<()> {
     files::write(path, &bytes)
 }
 
-/// A table of ours that lacks something: it was changed by hand, or comes from another version.
+/// An error in a table that could be read: it was edited by hand, or comes from another version.
 fn inside(problem: PolarsError) -> Error {
-    Error::BadSetting(format!("the study's tables do not fit together: {problem}"))
+    Error::BadSetting(format!("the tables of the study are inconsistent: {problem}"))
 }

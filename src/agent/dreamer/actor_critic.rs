@@ -1,71 +1,22 @@
-//! Actor and critic, which live in imagination: from every state that experience has led to, a dream; the critic learns what
-//! dreams are worth, the actor to have better ones.
+//! Actor and critic of DreamerV3, which learn from rollouts imagined in the world model: the critic by two-hot symexp
+//! regression on lambda-returns, the actor by REINFORCE with an entropy bonus.
+//!
+//! Equation numbers are those of Hafner et al. 2023, arXiv v1.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
-use serde::{Deserialize, Serialize};
 
-use super::returns::{lambda_returns, replayed_returns};
+use super::config::ActorCriticConfig;
+use super::returns::{lambda_returns, replay_lambda_returns};
 use crate::agent::Losses;
-use crate::error::{Error, Result};
 use crate::model::{Latent, WorldModel};
-use crate::nn::ops::{self, record};
-use crate::nn::{BoundedNormal, Grad, Mlp, Tensor3, copy_parameters, parameters_of_fields, polyak, tensor, values};
+use crate::nn::{
+    BoundedNormal, Grad, Mlp, TapeOps, Tensor3, copy_parameters, ops, parameters_of_fields, polyak, tensor, values,
+};
 use crate::replay::SequenceBatch;
 use crate::rng::{self, Rng};
 
-/// Settings of an [`ActorCritic`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ActorCriticConfig {
-    /// Width of the hidden layers of both.
-    pub units: usize,
-    /// Hidden layers of both.
-    pub layers: usize,
-    /// Steps of a dream.
-    pub horizon: usize,
-    /// How far returns trust in rewards before they trust in values: 0 for one step, 1 for the whole dream.
-    pub lambda: f32,
-    /// What a nat of the policy's entropy is worth, in units of the returns' scale.
-    pub entropy: f32,
-    /// The smallest deviation of the policy.
-    pub min_std: f32,
-    /// How fast the slow critic follows, per update.
-    pub slow_rate: f32,
-    /// Weight of the critic's loss on what was experienced.
-    pub replayed: f32,
-}
-
-impl Default for ActorCriticConfig {
-    fn default() -> Self {
-        Self {
-            units: 64,
-            layers: 3,
-            horizon: 15,
-            lambda: 0.95,
-            entropy: 3e-4,
-            min_std: 0.1,
-            slow_rate: 0.02,
-            replayed: 0.3,
-        }
-    }
-}
-
-impl ActorCriticConfig {
-    /// # Errors
-    /// If a setting cannot be used.
-    pub(crate) fn check(&self) -> Result<()> {
-        if self.units == 0 || self.layers == 0 || self.horizon == 0 {
-            return Err(Error::BadSetting("dreamer: `units`, `layers` and `horizon` must be at least 1".into()));
-        }
-        if !(0.0..=1.0).contains(&self.lambda) || !(0.0..1.0).contains(&self.min_std) || self.min_std <= 0.0 {
-            return Err(Error::BadSetting("dreamer: `lambda` must lie in [0, 1], `min_std` between 0 and 1".into()));
-        }
-        Ok(())
-    }
-}
-
-/// The networks of both.
+/// The actor (a policy over the features of latent states) and the critic (a two-hot distribution of returns).
 #[derive(Clone, Debug)]
 pub struct ActorCritic {
     config: ActorCriticConfig,
@@ -76,169 +27,216 @@ pub struct ActorCritic {
 
 parameters_of_fields!(ActorCritic: policy, critic);
 
-/// A slow copy of the critic, which steadies it.
-pub type SlowCritic = Mlp;
+/// The target network: an exponential moving average of the critic, towards whose predictions the critic is regularised.
+#[doc(alias = "target network")]
+#[doc(alias = "slow critic")]
+pub type TargetCritic = Mlp;
 
-/// Futures that were imagined, from many states at once. Lists hold an entry for each moment, the start first.
-pub struct Dream {
-    /// What was believed, `[1, rows, features]` each.
+/// Rollouts imagined in the world model, from many latent states at once, with H the horizon. Every list holds an entry for
+/// each time step, the start first.
+#[doc(alias = "imagination")]
+#[doc(alias = "dream")]
+#[derive(Clone, Debug)]
+pub struct ImaginedRollout {
+    /// The features of the latent states, `[1, rows, features]` each, H + 1 of them.
     pub features: Vec<Tensor3>,
-    /// What was done at each moment but the last, `[rows, actions]` each.
+    /// The actions drawn from the policy, `[rows, actions]` each, H of them; not clipped to [-1, 1].
     pub actions: Vec<Vec<f32>>,
-    /// What the critic said.
+    /// The critic's values, `[rows]` each, H + 1 of them.
     pub values: Vec<Vec<f32>>,
-    /// Lambda returns, for each moment but the last.
+    /// [Lambda-returns](lambda_returns), `[rows]` each, H of them.
     pub returns: Vec<Vec<f32>>,
-    /// How much each moment counts: the chance, discounted, that the episode lasts till there.
+    /// The weight of each time step in the losses: the product of the predicted continuations (times discount) up to and
+    /// including it, `[rows]` each, H of them.
     pub weights: Vec<Vec<f32>>,
 }
 
+/// The losses of actor and critic on an [`ImaginedRollout`], `[1, rows, 1]` for each of its H time steps.
+#[derive(Clone, Debug)]
+pub struct ActorCriticLoss {
+    /// REINFORCE with entropy bonus, eq. 11.
+    pub policy: Vec<Tensor3>,
+    /// Two-hot cross-entropy of the lambda-return and of the target network's value.
+    pub critic: Vec<Tensor3>,
+    /// Means, for the log.
+    pub report: Losses,
+}
+
+impl ActorCriticLoss {
+    /// The losses with their weights, both averaged over time: what [`ops::total`] sums up.
+    pub fn weighted(&self) -> Vec<(f32, Tensor3)> {
+        let each = 1.0 / self.policy.len() as f32;
+        let pairs = self.policy.iter().zip(&self.critic);
+        pairs.flat_map(|(policy, critic)| [(each, policy.clone()), (each, critic.clone())]).collect()
+    }
+}
+
 impl ActorCritic {
-    /// New networks for a world model's features. At first the policy does the same everywhere, and all is worth nothing.
-    pub fn new(world: &WorldModel, actions: usize, config: &ActorCriticConfig, rng: &mut Rng) -> (Self, SlowCritic) {
+    /// New networks for the features of a world model, and the target network. At first the policy is nearly the same in
+    /// all states, and every value is zero.
+    pub fn new(world: &WorldModel, actions: usize, config: &ActorCriticConfig, rng: &mut Rng) -> (Self, TargetCritic) {
         let hidden = vec![config.units; config.layers];
         let features = world.config().rssm.features();
         let policy = Mlp::dreamer(world.device(), features, &hidden, Some(2 * actions), rng).scale_output(0.01);
         let critic = Mlp::dreamer(world.device(), features, &hidden, Some(world.bins().count()), rng).scale_output(0.0);
         // A copy with tensors of its own.
-        let mut slow = critic.clone();
-        copy_parameters(&mut slow, &critic);
-        (Self { config: config.clone(), actions, policy, critic }, slow)
+        let mut target = critic.clone();
+        copy_parameters(&mut target, &critic);
+        (Self { config: config.clone(), actions, policy, critic }, target)
     }
 
-    /// Lets the slow critic follow.
-    pub fn update_target(&self, slow: &mut SlowCritic) {
-        polyak(slow, &self.critic, self.config.slow_rate);
+    /// Moves the target network towards the critic: `target <- (1 - rate) target + rate critic`.
+    #[doc(alias = "Polyak averaging")]
+    #[doc(alias = "EMA")]
+    pub fn update_target(&self, target: &mut TargetCritic) {
+        polyak(target, &self.critic, self.config.slow_rate);
     }
 
     fn distribution(&self, head: &[f32], i: usize) -> BoundedNormal {
         BoundedNormal::new(head[i], head[self.actions + i], self.config.min_std)
     }
 
-    /// The policy's mean actions, `[rows, actions]`; or those that lie `noise` (of the same form) deviations away from
-    /// them, which may lie beyond [-1, 1].
+    /// The policy's mean actions for features `[1, rows, features]`: `[rows, actions]`. With standard normal `noise`
+    /// (`[rows, actions]`) the actions are `mean + std noise`, which may lie outside [-1, 1].
     pub fn act(&self, features: &Tensor3, noise: Option<&[f32]>) -> Vec<f32> {
         let head = self.policy.forward(features.clone(), Grad::Input);
         let rows = values(&head).chunks_exact(2 * self.actions);
-        let drawn = rows.flat_map(|head| (0..self.actions).map(|i| self.distribution(head, i)));
+        let normals = rows.flat_map(|head| (0..self.actions).map(|i| self.distribution(head, i)));
         match noise {
-            None => drawn.map(|normal| normal.mean).collect(),
-            Some(noise) => drawn.zip(noise).map(|(normal, noise)| normal.mean + normal.std * noise).collect(),
+            None => normals.map(|normal| normal.mean).collect(),
+            Some(noise) => normals.zip(noise).map(|(normal, noise)| normal.mean + normal.std * noise).collect(),
         }
     }
 
-    /// What the critic says of features.
+    /// The critic's values of features `[1, rows, features]`: `[rows]`.
     pub fn values(&self, world: &WorldModel, features: &Tensor3) -> Vec<f32> {
-        world.bins().read(&self.critic.forward(features.clone(), Grad::Input))
+        world.bins().decode(&self.critic.forward(features.clone(), Grad::Input))
     }
 
-    /// Dreams from each row of `start`.
-    pub fn dream(&self, world: &WorldModel, start: &Latent, rng: &mut Rng) -> Dream {
+    /// Imagines a rollout from each row of `start`: actions from the policy, latent states from the prior.
+    #[doc(alias = "dream")]
+    pub fn imagine(&self, world: &WorldModel, start: &Latent, rng: &mut Rng) -> ImaginedRollout {
+        let (rows, horizon) = (start.rows(), self.config.horizon);
         let mut latent = start.clone();
         let mut features = vec![latent.features()];
-        let mut actions = Vec::with_capacity(self.config.horizon);
-        let rows = start.deter.shape().1;
-        for t in 0..self.config.horizon {
+        let mut actions = Vec::with_capacity(horizon);
+        for t in 0..horizon {
             let noise: Vec<f32> = (0..rows * self.actions).map(|_| rng::normal(rng) as f32).collect();
             let drawn = self.act(&features[t], Some(&noise));
-            let seen: Vec<f32> = drawn.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
-            latent = world.imagine(&latent, &tensor(world.device(), seen, (1, rows, self.actions)), rng);
+            let clipped: Vec<f32> = drawn.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
+            latent = world.imagine(&latent, &tensor(world.device(), clipped, (1, rows, self.actions)), rng);
             features.push(latent.features());
             actions.push(drawn);
         }
         let rewards: Vec<_> = features.iter().map(|features| world.rewards(features)).collect();
-        let continues: Vec<_> = features.iter().map(|features| world.continues(features)).collect();
+        let continuations: Vec<_> = features.iter().map(|features| world.continuations(features)).collect();
         let values: Vec<_> = features.iter().map(|features| self.values(world, features)).collect();
-        let mut lasting = vec![1.0; values[0].len()];
-        let mut weights = Vec::with_capacity(self.config.horizon);
-        for continues in &continues[..self.config.horizon] {
-            lasting.iter_mut().zip(continues).for_each(|(weight, c)| *weight *= c);
-            weights.push(lasting.clone());
+        let mut weight = vec![1.0; rows];
+        let mut weights = Vec::with_capacity(horizon);
+        for continuations in &continuations[..horizon] {
+            weight.iter_mut().zip(continuations).for_each(|(weight, c)| *weight *= c);
+            weights.push(weight.clone());
         }
-        let returns = lambda_returns(&rewards, &continues, &values, self.config.lambda);
-        Dream { features, actions, values, returns, weights }
+        let returns = lambda_returns(&rewards, &continuations, &values, self.config.lambda);
+        ImaginedRollout { features, actions, values, returns, weights }
     }
 
-    /// The losses of actor and critic on a dream, recorded on `tape`. Advantages are divided by `scale`. The dream itself
-    /// is fixed: no gradient flows into the world.
-    pub fn losses<T: Tape<f32, Cpu>>(
+    /// The losses of actor and critic on an imagined rollout, recorded on `tape`. Advantages are divided by `scale`, the
+    /// [return scale](super::ReturnScale) S. The rollout is fixed: features, actions and returns are under a stop-gradient.
+    pub fn loss<T: Tape<f32, Cpu>>(
         &self,
         tape: &mut T,
         world: &WorldModel,
-        slow: &SlowCritic,
-        dream: &Dream,
+        target: &TargetCritic,
+        rollout: &ImaginedRollout,
         scale: f32,
-    ) -> (Vec<(f32, Tensor3)>, Losses) {
+    ) -> ActorCriticLoss {
         let share = 1.0 / self.config.horizon as f32;
-        let mut parts = Vec::with_capacity(2 * self.config.horizon);
-        let (mut entropy, mut advantage) = (0.0, 0.0);
-        let [mut of_policy, mut of_critic] = [0.0; 2];
-        let mean = |numbers: &[f32]| numbers.iter().sum::<f32>() / numbers.len() as f32;
-        for (t, actions) in dream.actions.iter().enumerate() {
-            let (features, weights) = (&dream.features[t], &dream.weights[t]);
-            let advantages: Vec<f32> =
-                dream.returns[t].iter().zip(&dream.values[t]).map(|(r, v)| (r - v) / scale).collect();
-            advantage += share * advantages.iter().map(|a| a.abs()).sum::<f32>() / advantages.len() as f32;
-            let policy = record(tape, features, |features| {
-                let head = self.policy.forward(features, Grad::Params);
-                ops::rowwise(head, |row, head, slope| {
-                    let actions = &actions[row * self.actions..][..self.actions];
-                    let (loss, nats) = self.policy_loss(head, actions, weights[row], advantages[row], slope);
-                    entropy += share * nats / weights.len() as f32;
-                    loss
-                })
+        let (mut policy_losses, mut critic_losses) = (Vec::new(), Vec::new());
+        let [mut policy_loss, mut critic_loss, mut policy_entropy, mut advantage_magnitude] = [0.0; 4];
+        for t in 0..rollout.actions.len() {
+            let (features, weights) = (&rollout.features[t], &rollout.weights[t]);
+            let (actions, returns) = (&rollout.actions[t], &rollout.returns[t]);
+            // (R_t - v_t) / S.
+            let advantages: Vec<f32> = returns.iter().zip(&rollout.values[t]).map(|(r, v)| (r - v) / scale).collect();
+            let head = self.policy.on(tape, features, Grad::Params);
+            let policy = tape.rowwise(&head, |row, head, slope| {
+                let actions = &actions[row * self.actions..][..self.actions];
+                let (loss, entropy) = self.reinforce(head, actions, weights[row], advantages[row], slope);
+                policy_entropy += share * entropy / weights.len() as f32;
+                loss
             });
-            let steady = world.bins().read(&slow.forward(features.clone(), Grad::Input));
-            let critic = record(tape, features, |features| {
-                let logits = self.critic.forward(features, Grad::Params);
-                ops::scale_rows(world.bins().loss(logits, &[&dream.returns[t], &steady]), weights)
-            });
-            of_policy += share * ops::mean(&policy);
-            of_critic += share * ops::mean(&critic);
-            parts.extend([(share, policy), (share, critic)]);
+            let target_values = world.bins().decode(&target.forward(features.clone(), Grad::Input));
+            let critic = self.critic_loss(tape, world, features, Grad::Params, [returns, &target_values], weights);
+            advantage_magnitude += share * advantages.iter().map(|a| a.abs()).sum::<f32>() / advantages.len() as f32;
+            policy_loss += share * ops::mean(&policy);
+            critic_loss += share * ops::mean(&critic);
+            policy_losses.push(policy);
+            critic_losses.push(critic);
         }
         let report = Losses::from([
-            ("policy_loss", of_policy),
-            ("critic_loss", of_critic),
-            ("policy_entropy", entropy),
-            ("advantage", advantage),
-            ("imagined_value", mean(&dream.values[0])),
+            ("policy_loss", policy_loss),
+            ("critic_loss", critic_loss),
+            ("policy_entropy", policy_entropy),
+            ("advantage_magnitude", advantage_magnitude),
+            ("imagined_value", rollout.values[0].iter().sum::<f32>() / rollout.values[0].len() as f32),
         ]);
-        (parts, report)
+        ActorCriticLoss { policy: policy_losses, critic: critic_losses, report }
     }
 
-    /// REINFORCE with a baseline and a bonus for entropy, for one state: the loss, and the policy's entropy there; the
-    /// loss's gradient goes into `slope`.
-    fn policy_loss(&self, head: &[f32], actions: &[f32], weight: f32, advantage: f32, slope: &mut [f32]) -> (f32, f32) {
-        let (mut density, mut entropy) = (0.0, 0.0);
+    /// The actor's loss in one state, eq. 11, by REINFORCE with the critic as baseline:
+    ///
+    /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)])`
+    ///
+    /// with the weight `w_t` and the entropy coefficient eta. Also the entropy; the gradient with respect to the policy's
+    /// head goes into `slope`.
+    #[doc(alias = "policy gradient")]
+    #[doc(alias = "entropy bonus")]
+    fn reinforce(&self, head: &[f32], actions: &[f32], weight: f32, advantage: f32, slope: &mut [f32]) -> (f32, f32) {
+        let (mut log_density, mut entropy) = (0.0, 0.0);
         for (i, action) in actions.iter().enumerate() {
             let normal = self.distribution(head, i);
-            density += normal.log_density(*action);
+            log_density += normal.log_density(*action);
             entropy += normal.entropy();
             let [of_mean, of_std] = normal.slopes(*action, -weight * advantage, -weight * self.config.entropy);
             (slope[i], slope[self.actions + i]) = (of_mean, of_std);
         }
-        (-weight * (density * advantage + self.config.entropy * entropy), entropy)
+        (-weight * (log_density * advantage + self.config.entropy * entropy), entropy)
     }
 
-    /// The critic's loss on what was experienced, whose gradient flows into the beliefs too: they learn to tell what
-    /// matters. `features` are what is believed at each moment of the batch, `beyond` what dreams from there are worth.
-    pub fn replayed_loss<T: Tape<f32, Cpu>>(
+    /// The critic's loss: the two-hot cross-entropies of both `targets` (the lambda-returns, and the target network's values
+    /// as a regulariser), times a weight for each row.
+    fn critic_loss<T: Tape<f32, Cpu>>(
         &self,
         tape: &mut T,
         world: &WorldModel,
-        slow: &SlowCritic,
+        features: &Tensor3,
+        grad: Grad,
+        targets: [&[f32]; 2],
+        weights: &[f32],
+    ) -> Tensor3 {
+        let logits = self.critic.on(tape, features, grad);
+        let loss = world.bins().loss(tape, &logits, &targets);
+        tape.scale_rows(&loss, weights)
+    }
+
+    /// The critic's loss on replayed experience, with its weight. Its gradient flows into the `features` of the replayed
+    /// latent states too (`[1, length x sequences, features]`, rows as in `batch`), so that they learn to predict values.
+    /// Lambda-returns are bootstrapped with the `imagined_returns` from each of these states.
+    pub fn replay_critic_loss<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        world: &WorldModel,
+        target: &TargetCritic,
         batch: &SequenceBatch,
         features: &Tensor3,
-        beyond: &[f32],
+        imagined_returns: &[f32],
     ) -> (f32, Tensor3) {
-        let (returns, counts) = replayed_returns(batch, beyond, world.config().discount(), self.config.lambda);
-        let known = record(tape, features, |features| ops::rows(features, 0, returns.len()));
-        let steady = world.bins().read(&slow.forward(known.clone(), Grad::Input));
-        let loss = record(tape, &known, |known| {
-            let logits = self.critic.forward(known, Grad::Both);
-            ops::scale_rows(world.bins().loss(logits, &[&returns, &steady]), &counts)
-        });
+        let discount = world.config().discount();
+        let (returns, mask) = replay_lambda_returns(batch, imagined_returns, discount, self.config.lambda);
+        let features = tape.rows(features, 0, returns.len());
+        let target_values = world.bins().decode(&target.forward(features.clone(), Grad::Input));
+        let loss = self.critic_loss(tape, world, &features, Grad::Both, [&returns, &target_values], &mask);
         (self.config.replayed, loss)
     }
 }
@@ -259,14 +257,14 @@ mod tests {
         let (actor, _) = ActorCritic::new(&world, 2, &ActorCriticConfig::default(), &mut rng);
         let (head, actions, weight, advantage) = ([0.5, -0.3, 0.2, -1.0], [0.9, -1.4], 0.941_094, 0.864_437_3);
         let mut slope = [0.0; 4];
-        let (loss, entropy) = actor.policy_loss(&head, &actions, weight, advantage, &mut slope);
+        let (loss, entropy) = actor.reinforce(&head, &actions, weight, advantage, &mut slope);
         let expected = -f64::from(weight) * (-2.652_197_05 * f64::from(advantage) + 3e-4 * 2.466_678_86);
         assert!((f64::from(loss) - expected).abs() < 1e-5 && (entropy - 2.466_679).abs() < 1e-5, "{loss} {expected}");
         for (i, slope) in slope.iter().enumerate() {
             let moved = |by: f32| {
                 let mut head = head;
                 head[i] += by;
-                actor.policy_loss(&head, &actions, weight, advantage, &mut [0.0; 4]).0
+                actor.reinforce(&head, &actions, weight, advantage, &mut [0.0; 4]).0
             };
             let difference = (moved(1e-2) - moved(-1e-2)) / 2e-2;
             assert!((slope - difference).abs() < 1e-3, "{i}: {slope}, {difference} by differences");

@@ -1,46 +1,78 @@
-//! What the future is worth: lambda returns in imagination and in experience, and the scale of returns.
+//! Lambda-returns of imagined rollouts and of replayed experience, and the scale by which returns are normalised.
+//!
+//! Equation numbers are those of Hafner et al. 2023, arXiv v1.
 
 use serde::{Deserialize, Serialize};
 
 use crate::replay::SequenceBatch;
 
-/// Lambda returns of imagined futures. `rewards`, `continues` and `values` hold a list for each moment, the start first: a
-/// reward is for arriving at its moment, a continue tells how much the future counts there. One list fewer comes back:
+/// The lambda-returns of imagined rollouts (eq. 7):
 ///
-/// `R_t = r_{t+1} + c_{t+1} ((1 - lambda) v_{t+1} + lambda R_{t+1})`, and the last `R` is the last value.
-pub fn lambda_returns(rewards: &[Vec<f32>], continues: &[Vec<f32>], values: &[Vec<f32>], lambda: f32) -> Vec<Vec<f32>> {
+/// `R_t = r_{t+1} + c_{t+1} ((1 - lambda) v_{t+1} + lambda R_{t+1})`, and at the horizon `R_H = v_H`.
+///
+/// `rewards`, `continuations` and `values` hold a list `[rows]` for each of H + 1 time steps, the start first: a reward is for
+/// arriving at its time step, a continuation is the probability that the episode continues there, times the discount. The
+/// result has H lists.
+///
+/// ```
+/// use handful::agent::dreamer::lambda_returns;
+///
+/// let column = |x: [f32; 3]| x.map(|x| vec![x]);
+/// let (rewards, values) = (column([0.0, 1.0, 2.0]), column([0.0, 10.0, 20.0]));
+/// let returns = |lambda| lambda_returns(&rewards, &column([0.5; 3]), &values, lambda)[0][0];
+/// // One step and the critic; all steps and the critic at the horizon.
+/// assert_eq!(returns(0.0), 1.0 + 0.5 * 10.0);
+/// assert_eq!(returns(1.0), 1.0 + 0.5 * (2.0 + 0.5 * 20.0));
+/// ```
+#[doc(alias = "TD(lambda)")]
+#[doc(alias = "lambda-return")]
+#[doc(alias = "Bellman")]
+pub fn lambda_returns(
+    rewards: &[Vec<f32>],
+    continuations: &[Vec<f32>],
+    values: &[Vec<f32>],
+    lambda: f32,
+) -> Vec<Vec<f32>> {
     let horizon = values.len() - 1;
     let mut returns = vec![Vec::new(); horizon];
     let mut next = values[horizon].clone();
     for t in (0..horizon).rev() {
-        let after = rewards[t + 1].iter().zip(&continues[t + 1]).zip(&values[t + 1]);
-        for (next, ((r, c), v)) in next.iter_mut().zip(after) {
-            *next = r + c * ((1.0 - lambda) * v + lambda * *next);
+        let (rewards, continuations, values) = (&rewards[t + 1], &continuations[t + 1], &values[t + 1]);
+        for (row, next) in next.iter_mut().enumerate() {
+            *next = rewards[row] + continuations[row] * ((1.0 - lambda) * values[row] + lambda * *next);
         }
         returns[t].clone_from(&next);
     }
     returns
 }
 
-/// Lambda returns of experience, for all moments of a batch but the last, and whether each has one: where an episode ends
-/// there is no future in the batch. `beyond` is what is believed of the future from each moment on.
-pub fn replayed_returns(batch: &SequenceBatch, beyond: &[f32], discount: f32, lambda: f32) -> (Vec<f32>, Vec<f32>) {
-    let rows = batch.sequences;
-    let moments = rows * (batch.length - 1);
-    let (mut returns, mut counts) = (vec![0.0; moments], vec![0.0; moments]);
-    let mut next = beyond[moments..].to_vec();
-    for i in (0..moments).rev() {
-        let (after, next) = (i + rows, &mut next[i % rows]);
-        let live = if batch.terminal[after] { 0.0 } else { discount };
-        let on = if batch.last[after] { 0.0 } else { lambda };
-        *next = batch.rewards[after] + live * ((1.0 - on) * beyond[after] + on * *next);
+/// Lambda-returns of replayed experience for all time steps of a batch but the last, and a mask: 0 where an episode ends,
+/// since the future there is not in the batch. `bootstrap` holds the value of each time step's state, rows as in `batch`.
+pub fn replay_lambda_returns(
+    batch: &SequenceBatch,
+    bootstrap: &[f32],
+    discount: f32,
+    lambda: f32,
+) -> (Vec<f32>, Vec<f32>) {
+    let sequences = batch.sequences;
+    let count = sequences * (batch.length - 1);
+    let (mut returns, mut mask) = (vec![0.0; count], vec![0.0; count]);
+    let mut next = bootstrap[count..].to_vec();
+    for i in (0..count).rev() {
+        let (after, next) = (i + sequences, &mut next[i % sequences]);
+        let discount = if batch.terminal[after] { 0.0 } else { discount };
+        let lambda = if batch.last[after] { 0.0 } else { lambda };
+        *next = batch.rewards[after] + discount * ((1.0 - lambda) * bootstrap[after] + lambda * *next);
         returns[i] = *next;
-        counts[i] = f32::from(!batch.last[i]);
+        mask[i] = f32::from(!batch.last[i]);
     }
-    (returns, counts)
+    (returns, mask)
 }
 
-/// The range of returns, followed slowly: advantages are divided by it, but small returns are not blown up.
+/// Return normalisation (eq. 12): advantages are divided by the range from the 5th to the 95th percentile of the returns, as
+/// an exponential moving average, but by 1 at least, so that small returns are not amplified.
+#[doc(alias = "return normalization")]
+#[doc(alias = "percentile")]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReturnScale {
     low: f32,
@@ -48,32 +80,33 @@ pub struct ReturnScale {
 }
 
 impl ReturnScale {
+    /// Rate of the moving average.
     const RATE: f32 = 0.01;
 
-    /// A scale that has got so far.
+    /// A scale with saved percentiles, see [`ReturnScale::range`].
     pub fn from_range(low: f32, high: f32) -> Self {
         Self { low, high }
     }
 
-    /// Takes in the returns of a batch: their 5th and 95th percentiles.
+    /// Moves the percentiles towards those of the returns of a batch, which are sorted in place.
     pub fn update(&mut self, returns: &mut [f32]) {
         returns.sort_by(f32::total_cmp);
         self.low += Self::RATE * (percentile(returns, 0.05) - self.low);
         self.high += Self::RATE * (percentile(returns, 0.95) - self.high);
     }
 
-    /// What advantages are divided by, at least 1.
+    /// The divisor S of advantages, at least 1.
     pub fn scale(&self) -> f32 {
         (self.high - self.low).max(1.0)
     }
 
-    /// The low and the high end, to be saved.
+    /// The moving averages of the 5th and the 95th percentile, to be saved.
     pub fn range(&self) -> [f32; 2] {
         [self.low, self.high]
     }
 }
 
-/// Of sorted numbers, linear between two of them.
+/// A percentile of sorted numbers, by linear interpolation.
 fn percentile(sorted: &[f32], share: f32) -> f32 {
     let at = share * (sorted.len() - 1) as f32;
     let (below, between) = (at.floor() as usize, at.fract());
@@ -107,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn replayed_returns_are_the_references() {
+    fn replay_lambda_returns_are_the_references() {
         let batch = SequenceBatch {
             sequences: 1,
             length: 6,
@@ -116,9 +149,9 @@ mod tests {
             terminal: [0, 0, 0, 0, 0, 1].map(|x| x == 1).to_vec(),
             ..SequenceBatch::default()
         };
-        let (returns, counts) = replayed_returns(&batch, &[2.0, 1.9, 1.7, 1.6, 1.4, 1.2], 1.0 - 1.0 / 333.0, 0.95);
+        let (returns, mask) = replay_lambda_returns(&batch, &[2.0, 1.9, 1.7, 1.6, 1.4, 1.2], 1.0 - 1.0 / 333.0, 0.95);
         near(&returns, &[2.813_668_76, 2.342_776_47, 2.595_195_2, 0.353_933_93, 0.3]);
-        assert_eq!(counts, [1.0, 1.0, 1.0, 0.0, 1.0]);
+        assert_eq!(mask, [1.0, 1.0, 1.0, 0.0, 1.0]);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! `lift`: take the cube from the table. robosuite's Lift, with its numbers.
+//! `lift`: grasp the cube and lift it. robosuite's Lift, with its numbers.
 
 use nalgebra::Vector3;
 
@@ -18,7 +18,8 @@ pub(super) const LIFTED: f64 = 0.04;
 pub(super) const CUBE: usize = GRIPPER.end;
 const HAND_TO_CUBE: usize = CUBE + 12;
 
-/// The task. See the module's page.
+/// Grasp the cube and lift it 4 cm off the table: robosuite's Lift, with its numbers (but see [`TableTask::horizon`]).
+#[derive(Clone, Copy, Debug)]
 pub struct Lift;
 
 impl TableTask for Lift {

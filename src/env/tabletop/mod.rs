@@ -99,7 +99,7 @@ pub struct Tabletop {
     state: TabletopState,
 }
 
-/// All that the future of an episode depends on.
+/// Everything that the rest of an episode depends on.
 #[derive(Clone, Debug)]
 pub struct TabletopState {
     physics: Physics,
@@ -108,7 +108,7 @@ pub struct TabletopState {
     /// Kinematics at the start of the last physics step. robosuite sets its goals from these, one
     /// physics step old; so do we.
     measured: Kinematics,
-    /// Joint velocities at that moment, rad/s.
+    /// Joint velocities at that time, rad/s.
     measured_qd: JointVector,
     /// Where the finger servos are told to go, m, for each finger.
     finger_target: f64,
@@ -117,12 +117,12 @@ pub struct TabletopState {
 }
 
 impl Tabletop {
-    /// The world under the task.
+    /// The simulation under the task.
     pub fn physics(&self) -> &Physics {
         &self.state.physics
     }
 
-    /// What stands on the table.
+    /// The objects and the goal of this episode.
     pub fn setup(&self) -> &Setup {
         &self.state.setup
     }
@@ -145,7 +145,7 @@ impl Tabletop {
         self.options.observation == ObservationKind::Compact
     }
 
-    /// The compact observation, whichever kind the agent is given.
+    /// The compact observation at this time step, whichever kind the agent is given.
     pub fn compact(&self) -> &[f32] {
         &self.state.compact
     }

@@ -23,7 +23,8 @@ const HAND_TO_CUBE: usize = BASE + 12;
 const CUBE_TO_BASE: usize = HAND_TO_CUBE + 3;
 const TOUCHING: usize = CUBE_TO_BASE + 3;
 
-/// The task. See the module's page.
+/// Put the red cube on the green one: robosuite's Stack, with its numbers.
+#[derive(Clone, Copy, Debug)]
 pub struct Stack;
 
 impl TableTask for Stack {

@@ -7,8 +7,8 @@ use crate::chart::{Chart, Panels};
 use crate::error::Result;
 
 /// Success rate over environment steps for one task: a line for the mean of each learning method, its band from the
-/// worst seed to the best, and a dashed line for each method that does not learn. False, and nothing drawn, if none
-/// learns.
+/// worst seed to the best, and a dashed line for each method that does not learn. Returns `false`, and draws nothing,
+/// if no method learns.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -33,7 +33,7 @@ pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<bool>
         .between(-0.02, 1.04)
         .y_ticks(6, percent)
         .legend(SeriesLabelPosition::LowerRight);
-    // All bands first: none shall lie on a line.
+    // All bands first, so that none covers a line.
     for (colour, _, seeds, band, _) in &learning {
         if *seeds > 1 {
             chart = chart.band(band.iter().map(|(x, [low, _, high])| (*x, *low, *high))).coloured(*colour);

@@ -1,4 +1,4 @@
-//! The figures of a study, as SVG, from its tables alone.
+//! The figures of a study, as SVG, drawn from its tables alone.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub use learning::learning_curves;
 pub use test::tests;
 pub use training::{model, values};
 
-/// The methods that have the palette's colours in every figure of every study. Others take what is left.
+/// The methods that have the same colour of the palette in every study. Others take the colours that are left.
 const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "planet", "scripted", "random"];
 
 /// The methods of a task, each with its colour.
@@ -36,7 +36,7 @@ fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
 /// Environment steps, and the lowest, mean and highest value over the seeds at each.
 type Band = Vec<(f64, [f64; 3])>;
 
-/// The band over the steps that all seeds have.
+/// The band over the steps that all seeds have in common.
 fn band(curves: &[Curve]) -> Band {
     let Some((steps, _)) = curves.iter().min_by_key(|(x, _)| x.len()) else {
         return Vec::new();

@@ -12,7 +12,7 @@ use crate::files;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
 
-/// The test of every method on one task: success rate with its 95 % Wilson interval, and
+/// The final test of every method on one task: success rate with its 95 % Wilson interval, and
 /// smoothness of the hand if there is one.
 ///
 /// # Errors
@@ -28,7 +28,7 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
     let roughest = rows.iter().filter_map(|(.., sparc)| *sparc).reduce(f64::min);
     let count = rows.len();
     draw(path, |area| {
-        let area = area.margin(14, 10, 10, 10).titled(&format!("{task}: test at the end"), (FONT, 20))?;
+        let area = area.margin(14, 10, 10, 10).titled(&format!("{task}: final test"), (FONT, 20))?;
         let panel = |area: &Area, title: &str, left_margin: u32, from: f64, to: f64, is_share: bool| -> Drawn {
             let mut chart = ChartBuilder::on(area)
                 .caption(title, (FONT, 15))

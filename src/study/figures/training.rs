@@ -7,11 +7,11 @@ use super::{Band, Tables, band, means, percent, save, thousands};
 use crate::chart::{Chart, PALETTE, Panels};
 use crate::error::Result;
 
-/// The steps ahead for which a model's error is drawn.
+/// The horizons, in steps, for which a model's open-loop prediction error is drawn.
 const HORIZONS: [u32; 3] = [1, 5, 15];
 
-/// A method's model over training: its open-loop prediction error so many steps ahead, and the coverage of its 90 %
-/// interval. False, and nothing drawn, if the method has no model.
+/// The quality of a method's model over training: its open-loop prediction error at several horizons, and the coverage of
+/// its 90 % interval. Returns `false`, and draws nothing, if the method has no model.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -36,14 +36,14 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
         .mark(1.0)
         .legend(SeriesLabelPosition::UpperRight);
     let coverage =
-        over_training("truth inside the 90 % interval", &coverages).between(0.0, 1.03).y_ticks(11, percent).mark(0.9);
-    let title = format!("{task}: open-loop predictions of the model of {method} in held-out episodes");
+        over_training("coverage of the 90 % interval", &coverages).between(0.0, 1.03).y_ticks(11, percent).mark(0.9);
+    let title = format!("{task}: open-loop predictions of {method} on held-out episodes");
     save(&Panels::new(&title).panel(error).panel(coverage), path)?;
     Ok(true)
 }
 
-/// A method's estimated value over training, beside the discounted return that followed. False, and nothing drawn, if
-/// the method estimates none.
+/// A method's estimated value over training, beside the discounted return that followed. Returns `false`, and draws
+/// nothing, if the method estimates none.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -61,13 +61,13 @@ pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<
         (PALETTE[0], "estimated value".to_string(), estimated),
         (PALETTE[1], "return that followed".to_string(), followed),
     ];
-    let means = over_training("mean over all time steps", &both)
+    let means = over_training("mean over time steps", &both)
         .between(low, high)
         .y_ticks(11, if high - low < 10.0 { tenths } else { whole });
-    let correlation = [(PALETTE[2], "over all time steps".to_string(), correlation)];
+    let correlation = [(PALETTE[2], "over time steps".to_string(), correlation)];
     let correlation =
         over_training("correlation of the two", &correlation).between(-0.3, 1.03).y_ticks(11, tenths).mark(1.0);
-    let title = format!("{task}: value that {method} estimates, and the discounted return that followed");
+    let title = format!("{task}: value estimated by {method}, and the discounted return that followed");
     save(&Panels::new(&title).panel(means).panel(correlation), path)?;
     Ok(true)
 }

@@ -1,28 +1,32 @@
-//! Shifting and scaling features to mean zero and deviation one.
+//! Standardisation: features shifted and scaled to mean zero and standard deviation one.
 
 use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::nn::frozen::Feature;
 use crate::nn::kernels::vectorised_fn;
 
-/// Mean and scale of each of several features.
+/// Mean and scale of each feature: `x -> (x - mean) / scale`.
+#[doc(alias = "standardisation")]
+#[doc(alias = "standard scaler")]
+#[doc(alias = "normalizer")]
 #[derive(Clone, Debug, PartialEq)]
 pub struct Normaliser {
-    /// What is subtracted.
+    /// Mean of each feature, which is subtracted.
     pub mean: Vec<f32>,
-    /// What the rest is divided by.
+    /// Standard deviation of each feature, or its floor: the divisor.
     pub scale: Vec<f32>,
 }
 
 impl Normaliser {
-    /// Leaves `features` numbers as they are.
+    /// A normaliser that leaves `features` features unchanged.
     pub fn identity(features: usize) -> Self {
         Self { mean: vec![0.0; features], scale: vec![1.0; features] }
     }
 
-    /// Mean and standard deviation of rows, `floors.len()` numbers each, summed in float64. A feature whose
-    /// deviation lies below its floor has hardly moved; it is divided by the floor, lest its first move look like a
-    /// thousand deviations.
+    /// Mean and standard deviation of `rows`, `[count, features]` with `features = floors.len()`, summed in float64.
+    ///
+    /// A feature whose standard deviation lies below its floor has hardly moved in the data; it is divided by the floor,
+    /// or its first real change would be an outlier of a thousand standard deviations.
     pub fn fit(rows: &[f32], floors: &[f32]) -> Self {
         let width = floors.len();
         let n = (rows.len() / width).max(1) as f64;
@@ -41,7 +45,7 @@ impl Normaliser {
         }
     }
 
-    /// Normalises rows in place.
+    /// Normalises rows, `[count, features]`, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
         for row in rows.chunks_exact_mut(self.mean.len()) {
             let features = self.mean.iter().zip(&self.scale);
@@ -50,21 +54,21 @@ impl Normaliser {
     }
 
     /// Normalises a panel in place.
-    pub(super) fn normalise_panel(&self, panel: &mut [Feature]) {
+    pub(crate) fn normalise_panel(&self, panel: &mut [Feature]) {
         normalise_panel(panel, &self.mean, &self.scale);
     }
 
-    /// Writes it into `weights`, under `prefix`.
+    /// Stores `{prefix}.mean` and `{prefix}.scale` in `weights`.
     pub fn save(&self, weights: &mut Weights, prefix: &str) {
         let size = [1, 1, self.mean.len()];
         weights.insert(format!("{prefix}.mean"), self.mean.clone(), size);
         weights.insert(format!("{prefix}.scale"), self.scale.clone(), size);
     }
 
-    /// Reads what [`Normaliser::save`] wrote for as many features.
+    /// Loads what [`Normaliser::save`] stored.
     ///
     /// # Errors
-    /// If it is missing or of another size.
+    /// If an array is missing or has another number of features; the normaliser is unchanged then.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let size = [1, 1, self.mean.len()];
         let mean = weights.get(&format!("{prefix}.mean"), size)?.to_vec();
@@ -87,8 +91,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn still_features_keep_their_floor_and_large_offsets_their_spread() {
-        // A spread of 0.01 on an offset of 1000: single precision sums would lose it.
+    fn constant_features_keep_their_floor_and_large_offsets_their_standard_deviation() {
+        // A standard deviation of 0.5 on an offset of 1000: single precision sums would lose it.
         let rows: Vec<f32> = (0..1000).flat_map(|i| [1000.0 + if i % 2 == 0 { 0.5 } else { -0.5 }, 7.0]).collect();
         let normaliser = Normaliser::fit(&rows, &[1e-3, 0.25]);
         assert!((normaliser.mean[0] - 1000.0).abs() < 1e-4 && (normaliser.scale[0] - 0.5).abs() < 1e-5);

@@ -1,0 +1,170 @@
+//! Open-loop error of learned models over the prediction horizon. Records episodes, trains an ensemble, an autoencoder and a
+//! recurrent state-space model on the same ones, and evaluates all three on others: `data/open_loop/TASK.csv` and
+//! `TASK.svg`.
+//!
+//! `cargo run --example open_loop` (a few minutes); with names of tasks as arguments, only those.
+
+use std::error::Error;
+use std::path::Path;
+
+use handful::agent::{DreamerConfig, Preset};
+use handful::chart::Chart;
+use handful::env::{Env, Spec, Task, World};
+use handful::model::open_loop::{Episode, OpenLoopModel, open_loop};
+use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, WorldModel};
+use handful::nn::{Adam, AdamConfig};
+use handful::plan::noise::ColoredNoise;
+use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
+use handful::rng::{self, Rng};
+
+/// Episodes for training.
+const TRAINING: u64 = 60;
+/// Episodes for evaluation.
+const HELD_OUT: u64 = 20;
+/// Gradient steps of each model.
+const STEPS: usize = 4000;
+/// Weight of the scripted policy's action, for one episode after the other; noise has 1.2 minus that.
+const POLICY_WEIGHTS: [f64; 3] = [1.0, 0.7, 0.0];
+
+/// Episodes of the scripted policy, of the policy with noise, and of noise alone.
+struct Dataset {
+    episodes: Vec<Episode>,
+    transitions: ReplayBuffer,
+    sequences: SequenceReplay,
+}
+
+fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Dataset, Box<dyn Error>> {
+    let mut world: World = task.make();
+    let Spec { horizon, action_size, .. } = *world.spec();
+    let size = world.spec().observation_size();
+    let policy = task.scripted_policy(Default::default()).ok_or("a task with a scripted policy")?;
+    let mut dataset = Dataset {
+        episodes: Vec::new(),
+        transitions: ReplayBuffer::new(size, action_size, usize::MAX),
+        sequences: SequenceReplay::new(size, action_size, usize::MAX),
+    };
+    for seed in seeds {
+        let weight = POLICY_WEIGHTS[seed as usize % POLICY_WEIGHTS.len()];
+        let noise = ColoredNoise::new(2.0, horizon).sample_actions(action_size, rng);
+        let mut obs = world.reset(seed);
+        let mut episode = Episode { observations: vec![obs.clone()], ..Episode::default() };
+        for noise in noise.chunks_exact(action_size) {
+            let mixed = policy(&obs)
+                .into_iter()
+                .zip(noise)
+                .map(|(scripted, noise)| weight * f64::from(scripted) + (1.2 - weight) * noise);
+            let action: Vec<f32> = mixed.map(|a| a.clamp(-1.0, 1.0) as f32).collect();
+            let step = world.step(&action)?;
+            episode.actions.push(action.clone());
+            episode.observations.push(step.observation.clone());
+            episode.rewards.push(step.reward);
+            let done = step.done();
+            let transition = Transition {
+                obs: std::mem::replace(&mut obs, step.observation.clone()),
+                action,
+                reward: step.reward,
+                next_obs: step.observation,
+                terminated: step.terminated,
+                truncated: step.truncated,
+            };
+            dataset.transitions.push(&transition);
+            dataset.sequences.push(&transition);
+            if done {
+                break;
+            }
+        }
+        dataset.episodes.push(episode);
+    }
+    Ok(dataset)
+}
+
+/// A row of `TASK.csv`: see [`handful::model::open_loop::OpenLoop`].
+#[derive(serde::Serialize)]
+struct Row {
+    model: &'static str,
+    horizon: usize,
+    rmse: f64,
+    rmse_p90: f64,
+    coverage90: f64,
+}
+
+/// A model compared only on what all models predict in the same form: latent models predict the orientation of a cube in
+/// canonical form.
+struct WithoutOrientation<'a, Model> {
+    model: &'a Model,
+    spec: &'a Spec,
+}
+
+impl<Model: OpenLoopModel> OpenLoopModel for WithoutOrientation<'_, Model> {
+    fn predicted_features(&self) -> Vec<(usize, f32)> {
+        let features = self.model.predicted_features().into_iter();
+        features.filter(|(i, _)| self.spec.observation[*i].cube.is_none()).collect()
+    }
+
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        self.model.open_loop_predictions(starts, horizon, rng)
+    }
+}
+
+fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
+    for row in open_loop(&WithoutOrientation { model, spec }, episodes, &mut rng::stream(0, "judge")) {
+        let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
+        println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
+        rows.push(Row { model: name, horizon, rmse, rmse_p90, coverage90 });
+    }
+}
+
+fn compare(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
+    let mut rng = rng::stream(0, "foresight");
+    let training = record(task, 0..TRAINING, &mut rng)?;
+    let held_out = record(task, 1000..1000 + HELD_OUT, &mut rng)?.episodes;
+    println!("{}: {} training transitions", task.name(), training.transitions.len());
+    let world = task.make();
+    let spec = world.spec();
+    let mut rows = Vec::new();
+
+    let config = EnsembleConfig { hidden: vec![200, 200], first_steps: STEPS, ..EnsembleConfig::default() };
+    let mut ensemble = Ensemble::new(spec, config, &mut rng)?;
+    ensemble.fit(&training.transitions, &mut rng);
+    evaluate("ensemble", &ensemble.dynamics(), spec, &held_out, &mut rows);
+
+    let mut autoencoder = Autoencoder::new(spec, &AutoencoderConfig::default(), &mut rng);
+    let mut optimiser = Adam::new(AdamConfig { max_norm: Some(10.0), ..AdamConfig::new(1e-3) });
+    for _ in 0..STEPS {
+        autoencoder.learn(&training.sequences.sample(16, 16, &mut rng), &mut optimiser);
+    }
+    evaluate("autoencoder", &autoencoder, spec, &held_out, &mut rows);
+
+    let DreamerConfig { world: config, learning_rate, batch, length, .. } =
+        DreamerConfig::preset_for("dreamer", task.name())?;
+    let mut rssm = WorldModel::new(spec, &config, &mut rng);
+    let mut optimiser = Adam::new(AdamConfig { warm_up: 100, ..AdamConfig::laprop(learning_rate) });
+    for _ in 0..STEPS {
+        rssm.learn(&training.sequences.sample(batch, length, &mut rng), &mut optimiser, &mut rng);
+    }
+    evaluate("rssm", &rssm, spec, &held_out, &mut rows);
+
+    std::fs::create_dir_all(folder)?;
+    let mut writer = csv::Writer::from_path(folder.join(format!("{}.csv", task.name())))?;
+    rows.iter().try_for_each(|row| writer.serialize(row))?;
+    writer.flush()?;
+    std::fs::write(folder.join(format!("{}.svg", task.name())), chart(&rows).svg()?)?;
+    Ok(())
+}
+
+fn chart(rows: &[Row]) -> Chart {
+    let largest = rows.iter().map(|row| row.rmse).fold(1.1, f64::max).min(2.0);
+    let chart = Chart::new("time steps ahead, open loop", "error (predicting no change: 1)")
+        .between(0.0, largest)
+        .dashed("no change", [(0.0, 1.0), (25.0, 1.0)]);
+    ["ensemble", "autoencoder", "rssm"].into_iter().fold(chart, |chart, model| {
+        let of_model = rows.iter().filter(|row| row.model == model);
+        chart.line(model, of_model.map(|row| (row.horizon as f64, row.rmse)))
+    })
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let named: Result<Vec<Task>, _> = std::env::args().skip(1).map(|name| name.parse()).collect();
+    let tasks = Some(named?).filter(|tasks| !tasks.is_empty()).unwrap_or_else(|| vec![Task::Reach, Task::Push]);
+    tasks.into_iter().try_for_each(|task| compare(task, Path::new("data/open_loop")))
+}

@@ -1,0 +1,64 @@
+//! What Dreamer remembers of an environment from one time step to the next.
+
+use super::DreamerConfig;
+use super::planner::LatentObjective;
+use super::update::Networks;
+use crate::model::{Latent, WorldModel};
+use crate::nn::tensor;
+use crate::plan::RecedingHorizon;
+use crate::rng::{self, Rng};
+
+/// The latent state of one environment, the last action taken there, and the plan that is followed, if there is a planner.
+pub(super) struct PolicyState {
+    pub latent: Latent,
+    pub action: Vec<f32>,
+    control: Option<RecedingHorizon>,
+    pub rng: Rng,
+}
+
+impl PolicyState {
+    /// The state of a slot, which depends on nothing but the slot's index.
+    pub fn of_slot(world: &WorldModel, config: &DreamerConfig, action_size: usize, index: usize) -> Self {
+        Self::new(world, config, action_size, rng::stream(index as u64, "dreamer seat"))
+    }
+
+    pub fn new(world: &WorldModel, config: &DreamerConfig, actions: usize, rng: Rng) -> Self {
+        let control = config
+            .planner
+            .as_ref()
+            .map(|planner| RecedingHorizon::new(planner.build(actions), actions, &config.control));
+        Self { latent: world.initial(1), action: vec![0.0; actions], control, rng }
+    }
+
+    /// To the state at the start of an episode.
+    pub fn reset(&mut self, world: &WorldModel) {
+        self.latent = world.initial(1);
+        self.action.fill(0.0);
+        if let Some(control) = &mut self.control {
+            control.reset();
+        }
+    }
+
+    /// Updates the latent state by an observation.
+    pub fn observe(&mut self, world: &WorldModel, obs: &[f32]) {
+        let before = tensor(world.device(), self.action.clone(), (1, 1, self.action.len()));
+        self.latent = world.observe(&self.latent, &before, obs, &mut self.rng);
+    }
+
+    /// Observes and acts: by the planner if there is one, else by the policy's mean, or with `noise` by so many of its
+    /// standard deviations away from the mean.
+    pub fn act(&mut self, networks: &Networks, obs: &[f32], noise: Option<&[f32]>) -> Vec<f32> {
+        let Networks { world, behaviour, .. } = networks;
+        self.observe(world, obs);
+        let action = match &mut self.control {
+            Some(control) => {
+                let rng = rng::fork(&mut self.rng);
+                let mut objective = LatentObjective { world, critic: behaviour, latent: &self.latent, rng };
+                control.act(&mut objective, &mut |_| {}, &mut self.rng)
+            }
+            None => behaviour.act(&self.latent.features(), noise),
+        };
+        self.action = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
+        self.action.clone()
+    }
+}

@@ -1,0 +1,111 @@
+//! One update of Dreamer: the world model on replayed sequences, actor and critic on rollouts imagined from them, all by one
+//! optimiser step (Hafner et al. 2023, algorithm 1 of the appendix).
+
+use dfdx::prelude::*;
+use dfdx::tensor::{Cpu, Gradients};
+use rayon::prelude::*;
+
+use super::actor_critic::{ActorCritic, ImaginedRollout, TargetCritic};
+use super::{Dreamer, DreamerConfig};
+use crate::agent::Losses;
+use crate::model::WorldModel;
+use crate::nn::{Parameters, TapeOps, ops, parameters_of_fields};
+use crate::replay::SequenceBatch;
+use crate::rng::{self, Rng};
+
+/// Every batch is cut into so many parts, whose gradients are computed in parallel and averaged. The number is fixed, so that
+/// results do not depend on the machine.
+pub(super) const PARTS: usize = 2;
+
+/// All networks. The target network is not trained: it follows the critic.
+#[derive(Clone, Debug)]
+pub(super) struct Networks {
+    pub world: WorldModel,
+    pub behaviour: ActorCritic,
+    pub target: TargetCritic,
+}
+
+parameters_of_fields!(Networks: world, behaviour);
+
+/// A part of an update.
+struct Part {
+    gradients: Gradients<f32, Cpu>,
+    losses: Losses,
+    rollout: ImaginedRollout,
+}
+
+impl Dreamer {
+    /// One update of world model, actor and critic on freshly sampled sequences. Returns the mean of every loss.
+    ///
+    /// # Panics
+    /// If the replay buffer does not hold `length` time steps yet.
+    pub fn learn(&mut self) -> Losses {
+        let DreamerConfig { batch, length, dreams, .. } = self.config;
+        let batches: Vec<(SequenceBatch, Rng)> = (0..PARTS)
+            .map(|_| (self.replay.sample(batch / PARTS, length, &mut self.rng), rng::fork(&mut self.rng)))
+            .collect();
+        let networks = &self.networks;
+        let starts = dreams.unwrap_or(length);
+        let parts: Vec<Part> =
+            batches.into_par_iter().map(|(batch, rng)| networks.world_model_update(&batch, starts, rng)).collect();
+        // The return scale is that of all parts together.
+        let mut returns: Vec<f32> = parts.iter().flat_map(|part| part.rollout.returns.concat()).collect();
+        self.scale.update(&mut returns);
+        let scale = self.scale.scale();
+        let parts: Vec<Part> = parts.into_par_iter().map(|part| networks.actor_critic_update(part, scale)).collect();
+
+        let mut losses = Losses::new();
+        let mut gradients = Gradients::leaky();
+        for mut part in parts {
+            for (name, value) in part.losses {
+                *losses.entry(name).or_default() += value / PARTS as f32;
+            }
+            for (_, parameter) in self.networks.parameters() {
+                let own = std::mem::take(&mut **part.gradients.get_or_alloc_mut(parameter).expect("memory"));
+                let sum = gradients.get_or_alloc_mut(parameter).expect("memory");
+                sum.iter_mut().zip(own).for_each(|(sum, own)| *sum += own / PARTS as f32);
+            }
+        }
+        losses.insert("gradient_norm", self.optimiser.step(&mut self.networks, &mut gradients));
+        losses.insert("return_scale", scale);
+        let Networks { behaviour, target, .. } = &mut self.networks;
+        behaviour.update_target(target);
+        losses
+    }
+}
+
+impl Networks {
+    /// The world model's loss on a batch, and rollouts imagined from the latent states of the last `starts` time steps of
+    /// each sequence. The critic's loss on the replayed sequences belongs here: its gradient flows into the world model.
+    fn world_model_update(&self, batch: &SequenceBatch, starts: usize, mut rng: Rng) -> Part {
+        let Self { world, behaviour, target } = self;
+        let mut tape = OwnedTape::default();
+        let loss = world.loss(&mut tape, batch, &mut rng);
+        let batch = batch.last(starts);
+        let rows = starts * batch.sequences;
+        let rollout = behaviour.imagine(world, &loss.latent.last(rows), &mut rng);
+        let features = tape.rows(&loss.features, loss.latent.rows() - rows, rows);
+        let replay_critic =
+            behaviour.replay_critic_loss(&mut tape, world, target, &batch, &features, &rollout.returns[0]);
+
+        let mut losses = Losses::from(loss.means());
+        losses.insert("replay_critic_loss", ops::mean(&replay_critic.1));
+        losses.insert("posterior_entropy", loss.posterior_entropy);
+        losses.insert("prior_entropy", loss.prior_entropy);
+        let mut all = loss.weighted();
+        all.push(replay_critic);
+        Part { gradients: ops::total(tape, &all).backward(), losses, rollout }
+    }
+
+    /// Adds the gradients of actor and critic on the imagined rollouts, with advantages divided by the return scale.
+    fn actor_critic_update(&self, part: Part, scale: f32) -> Part {
+        let Part { gradients, mut losses, rollout } = part;
+        let Self { world, behaviour, target } = self;
+        // A tape that adds to the gradients that are there already.
+        let (_, mut tape) = rollout.features[0].clone().traced(gradients).split_tape();
+        let loss = behaviour.loss(&mut tape, world, target, &rollout, scale);
+        let gradients = ops::total(tape, &loss.weighted()).backward();
+        losses.extend(loss.report);
+        Part { gradients, losses, rollout }
+    }
+}

@@ -1,0 +1,49 @@
+//! What is saved of PETS, and how good its model is.
+
+use super::Pets;
+use crate::agent::{Checkpoint, Diagnostics};
+use crate::checkpoint::Weights;
+use crate::error::Result;
+use crate::model::open_loop::{Episode, OpenLoop, open_loop};
+use crate::rng;
+
+impl Diagnostics for Pets {
+    fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
+        let measure = |dynamics| open_loop(dynamics, episodes, &mut rng::stream(0, "open loop"));
+        self.dynamics.as_ref().map(measure).unwrap_or_default()
+    }
+}
+
+impl Checkpoint for Pets {
+    fn weights(&self) -> Weights {
+        self.ensemble.weights()
+    }
+
+    fn load_weights(&mut self, weights: &Weights) -> Result<()> {
+        self.ensemble.load_weights(weights)?;
+        self.dynamics = self.ensemble.is_fitted().then(|| self.ensemble.dynamics());
+        Ok(())
+    }
+
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        self.ensemble.save_training_state(&mut state);
+        self.replay.save(&mut state, "replay");
+        state.insert_counts("counts", &[self.observed as u64]);
+        state.insert_counts("rng", &rng::state(&self.rng));
+        state.insert_counts("planner rng", &rng::state(&self.controller.rng));
+        state
+    }
+
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        let counts = state.counts("counts", 1)?;
+        let (own, planner) = (state.counts("rng", 4)?, state.counts("planner rng", 4)?);
+        self.ensemble.load_training_state(state)?;
+        self.replay.load(state, "replay")?;
+        self.observed = counts[0] as usize;
+        self.rng = rng::from_state(&own);
+        self.controller = self.controllers.make(rng::from_state(&planner));
+        self.random.reset();
+        Ok(())
+    }
+}

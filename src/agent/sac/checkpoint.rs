@@ -1,0 +1,73 @@
+//! What is saved of SAC, and how good its critics are.
+
+use dfdx::prelude::*;
+
+use super::Sac;
+use super::temperature::Temperature;
+use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
+use crate::checkpoint::Weights;
+use crate::error::Result;
+use crate::model::open_loop::Episode;
+use crate::nn::{Grad, ops, tensor};
+use crate::rng;
+
+impl Diagnostics for Sac {
+    fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
+        let of_episode = |episode: &Episode| {
+            let observations = episode.observations.concat();
+            let actions = self.modes(&observations).concat();
+            let actions = tensor(&self.cpu, actions, (1, episode.observations.len(), self.action_size));
+            let q = self.critics.forward(ops::join(self.observations(&observations), actions), Grad::Input);
+            let values = q.min::<(usize, usize), Axis<0>>().as_vec();
+            ValueEstimate::of_episode(&values, episode, self.config.discount)
+        };
+        episodes.iter().flat_map(of_episode).collect()
+    }
+}
+
+impl Checkpoint for Sac {
+    fn weights(&self) -> Weights {
+        let mut weights = Weights::default();
+        weights.insert_module("policy", &self.policy);
+        weights.insert_module("critics", &self.critics);
+        weights.insert_module("targets", &self.target_critics);
+        weights.insert("temperature", vec![self.temperature.log], [1, 1, 1]);
+        weights
+    }
+
+    fn load_weights(&mut self, weights: &Weights) -> Result<()> {
+        let log = weights.get("temperature", [1, 1, 1])?[0];
+        weights.load_module("policy", &mut self.policy)?;
+        weights.load_module("critics", &mut self.critics)?;
+        weights.load_module("targets", &mut self.target_critics)?;
+        self.temperature.log = log;
+        Ok(())
+    }
+
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        self.policy_optimiser.save(&mut state, "policy");
+        self.critic_optimiser.save(&mut state, "critics");
+        self.replay.save(&mut state, "replay");
+        state.insert_counts("counts", &[self.observed as u64, self.updates as u64]);
+        state.insert_counts("rng", &rng::state(&self.rng));
+        let Temperature { moments: [first, second], steps, .. } = self.temperature;
+        state.insert("temperature", vec![first, second, steps as f32], [1, 1, 3]);
+        state
+    }
+
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        let counts = state.counts("counts", 2)?;
+        let rng = rng::from_state(&state.counts("rng", 4)?);
+        let temperature = state.get("temperature", [1, 1, 3])?;
+        self.policy_optimiser.load(state, "policy", &self.policy)?;
+        self.critic_optimiser.load(state, "critics", &self.critics)?;
+        self.replay.load(state, "replay")?;
+        self.temperature.moments = [temperature[0], temperature[1]];
+        self.temperature.steps = temperature[2] as i32;
+        self.observed = counts[0] as usize;
+        self.updates = counts[1] as usize;
+        self.rng = rng;
+        Ok(())
+    }
+}

@@ -1,0 +1,96 @@
+//! Settings of [`Sac`](super::Sac).
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result};
+
+/// Settings of [`Sac`](super::Sac). [`Preset`](crate::agent::Preset) has tuned ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SacConfig {
+    /// Width of each hidden layer of policy and critics.
+    pub hidden: Vec<usize>,
+    /// Whether the critics' hidden layers have layer normalisation, which makes several updates for each time step stable.
+    pub layer_norm: bool,
+    /// Critics. The smallest of their values is used: with two, clipped double Q-learning (Fujimoto et al. 2018).
+    #[doc(alias = "clipped double Q")]
+    #[doc(alias = "twin critics")]
+    pub critics: usize,
+    /// Step size of policy and critics (Adam).
+    pub learning_rate: f32,
+    /// Step size of the temperature's logarithm (Adam).
+    pub temperature_rate: f32,
+    /// Temperature alpha at the start: the weight of entropy against reward.
+    #[doc(alias = "alpha")]
+    pub initial_temperature: f32,
+    /// Target entropy in nats, for each number of an action: -1 gives the usual -dim(A).
+    pub target_entropy: f32,
+    /// Transitions in a minibatch.
+    pub batch: usize,
+    /// Discount factor gamma, per time step.
+    #[doc(alias = "gamma")]
+    pub discount: f32,
+    /// Polyak averaging rate of the target critics (the target network), per critic update.
+    #[doc(alias = "tau")]
+    #[doc(alias = "target network")]
+    pub polyak: f32,
+    /// Capacity of the replay buffer, in transitions.
+    pub replay: usize,
+    /// Time steps of uniform random actions before the first update.
+    pub warm_up: usize,
+    /// Critic updates for each time step: the update-to-data ratio.
+    #[doc(alias = "UTD")]
+    pub updates_per_step: usize,
+    /// Critic updates for each update of policy and temperature.
+    pub critic_updates_per_policy_update: usize,
+    /// Gradients of policy and critics with a larger global norm are scaled down to it.
+    pub max_gradient_norm: Option<f32>,
+}
+
+impl Default for SacConfig {
+    fn default() -> Self {
+        Self {
+            hidden: vec![256, 256],
+            layer_norm: false,
+            critics: 2,
+            learning_rate: 3e-4,
+            temperature_rate: 3e-4,
+            initial_temperature: 1.0,
+            target_entropy: -1.0,
+            batch: 256,
+            discount: 0.99,
+            polyak: 0.005,
+            replay: 1_000_000,
+            warm_up: 1000,
+            updates_per_step: 1,
+            critic_updates_per_policy_update: 1,
+            max_gradient_norm: None,
+        }
+    }
+}
+
+impl SacConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        let positive = [
+            ("critics", self.critics),
+            ("batch", self.batch),
+            ("replay", self.replay),
+            ("critic_updates_per_policy_update", self.critic_updates_per_policy_update),
+        ];
+        for (name, value) in positive {
+            if value == 0 {
+                return Err(Error::BadSetting(format!("sac: `{name}` must be at least 1")));
+            }
+        }
+        if self.hidden.is_empty() || self.hidden.contains(&0) {
+            return Err(Error::BadSetting("sac: `hidden` must name at least one layer, each at least 1 wide".into()));
+        }
+        if !(0.0..=1.0).contains(&self.discount) || !(0.0..=1.0).contains(&self.polyak) {
+            return Err(Error::BadSetting("sac: `discount` and `polyak` must lie in [0, 1]".into()));
+        }
+        if self.initial_temperature.is_nan() || self.initial_temperature <= 0.0 {
+            return Err(Error::BadSetting("sac: `initial_temperature` must be positive".into()));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,307 @@
+//! Soft actor-critic (SAC) with automatic temperature (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and
+//! Applications", Algorithm 1; equation numbers below are that paper's). The model-free baseline.
+//!
+//! One update: [`Sac::learn`] samples a minibatch from the replay buffer, moves the critics towards the soft Bellman
+//! target, the policy up the critics' values and its entropy, the temperature towards the target entropy, and the target
+//! critics towards the critics.
+//!
+//! Deviations: log standard deviations are squashed into [-5, 2] as in CleanRL; the temperature's loss is
+//! -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
+//! and scaled by the environment's own [`Feature`](crate::env::Feature)s; truncated episodes are bootstrapped.
+
+mod checkpoint;
+mod config;
+mod temperature;
+
+use dfdx::prelude::*;
+use dfdx::tensor::Cpu;
+
+pub use config::SacConfig;
+use temperature::Temperature;
+
+use super::{Agent, Losses, Mode, Slot};
+use crate::env::Spec;
+use crate::error::Result;
+use crate::nn::ops;
+use crate::nn::{
+    Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, copy_parameters, device,
+    polyak, tensor, values,
+};
+use crate::replay::{Batch, ReplayBuffer, Transition};
+use crate::rng::{self, Rng};
+
+/// Scaled observations are clamped to this.
+const MAX_INPUT: f32 = 10.0;
+
+/// The SAC agent: a policy, its critics and target critics, a temperature, and a replay buffer.
+///
+/// ```
+/// use handful::prelude::*;
+///
+/// let mut env = Task::Pendulum.make();
+/// let config = SacConfig { hidden: vec![16], warm_up: 50, batch: 16, ..SacConfig::default() };
+/// let mut agent = Sac::new(env.spec(), config, 0)?;
+/// let mut obs = env.reset(0);
+/// agent.begin_episode();
+/// for _ in 0..60 {
+///     let action = agent.act(&obs, Mode::Explore);
+///     let Step { observation, reward, terminated, truncated, .. } = env.step(&action)?;
+///     agent.observe(&Transition { obs, action, reward, next_obs: observation.clone(), terminated, truncated });
+///     if let Some(losses) = agent.update() {
+///         assert!(losses["critic_loss"].is_finite() && losses["entropy"].is_finite());
+///     }
+///     obs = observation;
+/// }
+/// assert_eq!(agent.act(&obs, Mode::Evaluate).len(), 1);
+/// # Ok::<(), handful::error::Error>(())
+/// ```
+#[doc(alias = "SAC")]
+#[doc(alias = "soft actor-critic")]
+pub struct Sac {
+    config: SacConfig,
+    cpu: Cpu,
+    /// Centre and scale of each feature of an observation.
+    centre: Vec<f32>,
+    scale: Vec<f32>,
+    action_size: usize,
+    /// From observations to mean and log standard deviation of a squashed Gaussian.
+    policy: Mlp,
+    /// From observations and actions to Q; one member for each critic.
+    critics: Mlp,
+    /// The target network: follows the critics slowly.
+    target_critics: Mlp,
+    policy_optimiser: Adam,
+    critic_optimiser: Adam,
+    temperature: Temperature,
+    replay: ReplayBuffer,
+    observed: usize,
+    updates: usize,
+    rng: Rng,
+}
+
+impl Sac {
+    /// A new agent for an environment.
+    ///
+    /// # Errors
+    /// If a setting or the spec cannot be used.
+    pub fn new(spec: &Spec, config: SacConfig, seed: u64) -> Result<Self> {
+        config.check()?;
+        spec.check()?;
+        let cpu = device();
+        let mut rng = rng::stream(seed, "sac");
+        let (observation_size, action_size) = (spec.observation_size(), spec.action_size);
+        let policy = MlpConfig {
+            members: 1,
+            input: observation_size,
+            hidden: config.hidden.clone(),
+            output: Some(2 * action_size),
+            norm: Norm::None,
+            activation: Activation::Relu,
+            init: Init::Uniform,
+        };
+        let critics = MlpConfig {
+            members: config.critics,
+            input: observation_size + action_size,
+            output: Some(1),
+            norm: if config.layer_norm { Norm::Layer } else { Norm::None },
+            ..policy.clone()
+        };
+        let policy = Mlp::new(&cpu, &policy, &mut rng);
+        let critics = Mlp::new(&cpu, &critics, &mut rng);
+        // A copy with tensors of its own.
+        let mut target_critics = critics.clone();
+        copy_parameters(&mut target_critics, &critics);
+        let optimiser =
+            Adam::new(AdamConfig { max_norm: config.max_gradient_norm, ..AdamConfig::new(config.learning_rate) });
+        Ok(Self {
+            centre: spec.observation.iter().map(|feature| feature.centre).collect(),
+            scale: spec.observation.iter().map(|feature| feature.scale).collect(),
+            action_size,
+            policy,
+            critics,
+            target_critics,
+            policy_optimiser: optimiser.clone(),
+            critic_optimiser: optimiser,
+            temperature: Temperature::new(config.initial_temperature, config.temperature_rate),
+            replay: ReplayBuffer::new(observation_size, action_size, config.replay),
+            observed: 0,
+            updates: 0,
+            rng,
+            cpu,
+            config,
+        })
+    }
+
+    /// The temperature alpha: the weight of entropy against reward.
+    #[doc(alias = "alpha")]
+    pub fn temperature(&self) -> f32 {
+        self.temperature.alpha()
+    }
+
+    /// One update on a random minibatch: of the critics and their target network, and, when it is due, of policy and
+    /// temperature. Returns `critic_loss`, `q` (the critics' mean value), and of the policy `policy_loss`, `entropy` (of the
+    /// actions, in nats) and `temperature`; `critic_gradient` and `policy_gradient` are norms before clipping.
+    pub fn learn(&mut self) -> Losses {
+        let batch = self.replay.sample(self.config.batch, &mut self.rng);
+        let mut losses = self.update_critics(&batch);
+        self.updates += 1;
+        if self.updates.is_multiple_of(self.config.critic_updates_per_policy_update) {
+            losses.append(&mut self.update_policy(&batch));
+        }
+        losses
+    }
+
+    /// The target y of the critics, `[batch]`: [`soft_bellman_backup`] with a' ~ pi(s') and the smallest of the target
+    /// critics' values of (s', a'). No gradient flows into it (stop-gradient).
+    #[doc(alias = "Bellman")]
+    fn soft_bellman_target(&mut self, batch: &Batch) -> Vec<f32> {
+        let next_obs = self.observations(&batch.next_obs);
+        let head = self.policy.forward(next_obs.clone(), Grad::Input);
+        let (next_action, next_log_pi) = SquashedGaussian::from_head(head).sample(self.noise(batch.size));
+        let q = self.target_critics.forward(ops::join(next_obs, next_action), Grad::Input);
+        let min_q = q.min::<(usize, usize), Axis<0>>().as_vec();
+        soft_bellman_backup(batch, &min_q, &next_log_pi.as_vec(), self.temperature(), self.config.discount)
+    }
+
+    /// A step on the soft Bellman residual (equation 5), J_Q = E[(Q(s, a) - y)^2], summed over the critics (without the
+    /// factor 1/2); the target network follows.
+    fn update_critics(&mut self, batch: &Batch) -> Losses {
+        let critics = self.config.critics;
+        let y = self.soft_bellman_target(batch).repeat(critics);
+        let y = tensor(&self.cpu, y, (critics, batch.size, 1));
+        let actions = tensor(&self.cpu, batch.actions.clone(), (1, batch.size, self.action_size));
+        let input = ops::join(self.observations(&batch.obs), actions);
+        let q = self.critics.forward(input.leaky_traced(), Grad::Params);
+        let mean_q = values(&q).iter().sum::<f32>() / (critics * batch.size) as f32;
+        let loss = (q - y).square().mean() * critics as f32;
+        let critic_loss = loss.array();
+        let mut gradients = loss.backward();
+        let norm = self.critic_optimiser.step(&mut self.critics, &mut gradients);
+        polyak(&mut self.target_critics, &self.critics, self.config.polyak);
+        Losses::from([("critic_loss", critic_loss), ("critic_gradient", norm), ("q", mean_q)])
+    }
+
+    /// A step on the policy loss (equation 9), J_pi = E[alpha log pi(a|s) - min Q(s, a)] with reparameterised actions
+    /// a = tanh(mean + std * noise), and then on the temperature loss ([`Temperature::step`]).
+    fn update_policy(&mut self, batch: &Batch) -> Losses {
+        let obs = self.observations(&batch.obs);
+        let noise = self.noise(batch.size);
+        let head = self.policy.forward(obs.clone().leaky_traced(), Grad::Params);
+        let (action, log_pi) = SquashedGaussian::from_head(head).sample(noise);
+        let log_pis = log_pi.as_vec();
+        // Gradients flow through the critics to the action, but not into the critics.
+        let (action, tape) = action.split_tape();
+        let q = self.critics.forward(ops::join(obs.put_tape(tape), action), Grad::Input);
+        let min_q = q.min::<(usize, usize), Axis<0>>().mean();
+        let loss = log_pi.mean() * self.temperature() - min_q;
+        let policy_loss = loss.array();
+        let mut gradients = loss.backward();
+        let norm = self.policy_optimiser.step(&mut self.policy, &mut gradients);
+
+        let mean_log_pi = log_pis.iter().sum::<f32>() / log_pis.len() as f32;
+        let entropy_gap = mean_log_pi + self.config.target_entropy * self.action_size as f32;
+        self.temperature.step(entropy_gap);
+        Losses::from([
+            ("policy_loss", policy_loss),
+            ("policy_gradient", norm),
+            ("entropy", -mean_log_pi),
+            ("temperature", self.temperature()),
+        ])
+    }
+
+    /// The deterministic action tanh(mean) for each row of observations.
+    fn modes(&self, observations: &[f32]) -> Vec<Vec<f32>> {
+        let head = self.policy.forward(self.observations(observations), Grad::Input);
+        let actions = SquashedGaussian::from_head(head).mode();
+        values(&actions).chunks(self.action_size).map(<[f32]>::to_vec).collect()
+    }
+
+    /// Observations as the networks' input, scaled: `[1, rows, observation]`.
+    fn observations(&self, raw: &[f32]) -> Tensor3 {
+        let size = self.centre.len();
+        let features = || self.centre.iter().zip(&self.scale);
+        let mut scaled = Vec::with_capacity(raw.len());
+        for row in raw.chunks_exact(size) {
+            // A cube that fell off the table is far away; the networks need not know how far.
+            let row = row.iter().zip(features());
+            scaled.extend(row.map(|(x, (centre, scale))| ((x - centre) / scale).clamp(-MAX_INPUT, MAX_INPUT)));
+        }
+        tensor(&self.cpu, scaled, (1, raw.len() / size, size))
+    }
+
+    /// Standard normal noise, `[1, rows, actions]`.
+    fn noise(&mut self, rows: usize) -> Tensor3 {
+        let noise = (0..rows * self.action_size).map(|_| rng::normal(&mut self.rng) as f32).collect();
+        tensor(&self.cpu, noise, (1, rows, self.action_size))
+    }
+}
+
+impl Agent for Sac {
+    fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
+        if mode == Mode::Evaluate {
+            return self.modes(obs).remove(0);
+        }
+        if self.observed < self.config.warm_up {
+            return (0..self.action_size).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect();
+        }
+        let head = self.policy.forward(self.observations(obs), Grad::Input);
+        let noise = self.noise(1);
+        let (action, _) = SquashedGaussian::from_head(head).sample(noise);
+        values(&action).to_vec()
+    }
+
+    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
+        self.modes(&observations.concat())
+    }
+
+    fn observe(&mut self, transition: &Transition) {
+        self.replay.push(transition);
+        self.observed += 1;
+    }
+
+    fn update(&mut self) -> Option<Losses> {
+        if self.observed < self.config.warm_up {
+            return None;
+        }
+        // Inside the thread pool: a parallel section entered from outside hands its work over each time.
+        rayon::scope(|_| (0..self.config.updates_per_step).map(|_| self.learn()).last())
+    }
+}
+
+/// The soft Bellman backup (equations 2 and 3), `[batch]`:
+///
+/// ```text
+/// y = r + gamma (1 - terminated) (min Q(s', a') - alpha log pi(a'|s'))
+/// ```
+///
+/// `q` is min Q(s', a') and `log_pi` is log pi(a'|s'). A truncated episode is bootstrapped, a terminated one is not.
+#[doc(alias = "Bellman")]
+fn soft_bellman_backup(batch: &Batch, q: &[f32], log_pi: &[f32], temperature: f32, discount: f32) -> Vec<f32> {
+    let soft_values = q.iter().zip(log_pi).map(|(q, log_pi)| q - temperature * log_pi);
+    let steps = batch.rewards.iter().zip(&batch.terminated).zip(soft_values);
+    steps.map(|((reward, terminated), value)| reward + discount * (1.0 - terminated) * value).collect()
+}
+
+impl std::fmt::Debug for Sac {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.debug_struct("Sac")
+            .field("config", &self.config)
+            .field("observed", &self.observed)
+            .field("updates", &self.updates)
+            .field("temperature", &self.temperature())
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn targets_bootstrap_unless_the_task_ended() {
+        let batch = Batch { size: 2, rewards: vec![1.0, -0.5], terminated: vec![0.0, 1.0], ..Batch::default() };
+        let y = soft_bellman_backup(&batch, &[4.5, 2.0], &[-0.8, 1.2], 0.2, 0.99);
+        assert!((y[0] - 5.6134).abs() < 1e-6 && (y[1] + 0.5).abs() < 1e-6, "{y:?}");
+    }
+}

@@ -1,0 +1,113 @@
+//! Settings of an ensemble.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result};
+
+/// Settings of an [`Ensemble`](super::Ensemble).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EnsembleConfig {
+    /// Number of networks.
+    #[doc(alias = "ensemble size")]
+    #[doc(alias = "bootstraps")]
+    pub members: usize,
+    /// Number of members, the best on the validation set, that predict.
+    pub elites: usize,
+    /// Width of each hidden layer.
+    pub hidden: Vec<usize>,
+    /// Learning rate of AdamW.
+    pub learning_rate: f32,
+    /// Learning rate at the end of a fit, as a fraction of `learning_rate`; it decays linearly. 1 keeps it constant. With
+    /// decay the final weights, which plans are made with, depend less on the last minibatches.
+    pub final_learning_rate_fraction: f32,
+    /// Decoupled weight decay of AdamW: each step scales the weights by `1 - learning_rate * weight_decay`.
+    pub weight_decay: f32,
+    /// Transitions in each minibatch; every member has its own.
+    pub batch: usize,
+    /// Whether each member trains on a bootstrap sample (drawn with replacement) of the training set; otherwise on all of
+    /// it, in its own order.
+    #[doc(alias = "bagging")]
+    pub bootstrap: bool,
+    /// Fraction of the transitions held out as validation set (at most 2000): for early stopping, the choice of elites and
+    /// the temperature of the predicted standard deviations.
+    #[doc(alias = "validation ratio")]
+    pub held_out: f64,
+    /// Gradient steps of the first fit, at most.
+    pub first_steps: usize,
+    /// Gradient steps of each later fit, at most.
+    pub steps: usize,
+    /// Gradient steps between two evaluations on the validation set.
+    pub check_every: usize,
+    /// Early stopping: a fit ends after this many evaluations in a row in which no member has improved.
+    #[doc(alias = "early stopping")]
+    pub patience: usize,
+    /// Whether the bounds of the log-variance are learned (as in PETS) or constant (as in mbrl-lib's default).
+    pub learn_bounds: bool,
+    /// Exponent of the beta-NLL (Seitzer et al. 2022), from 0, the plain negative log-likelihood as in PETS, to 1: see
+    /// [`bounded_nll`](crate::nn::bounded_nll).
+    #[doc(alias = "beta-NLL")]
+    pub beta: f32,
+    /// Targets are clipped to this many standard deviations, so that rare large changes (a cube that tips over) do not
+    /// dominate the loss.
+    pub max_target: f32,
+    /// Whether the reward is learned too; otherwise a known reward function is needed for planning.
+    pub learn_reward: bool,
+    /// Whether each predicted change is multiplied by a learned gate, a sigmoid with its own output, which can close over
+    /// whole regions of the input: a cube that is not touched stays where it is. Without gates its predicted position
+    /// drifts slightly, and planners exploit that.
+    pub gated: bool,
+}
+
+impl Default for EnsembleConfig {
+    fn default() -> Self {
+        Self {
+            members: 5,
+            elites: 5,
+            hidden: vec![200; 3],
+            learning_rate: 1e-3,
+            final_learning_rate_fraction: 1.0,
+            weight_decay: 1e-2,
+            batch: 256,
+            bootstrap: false,
+            held_out: 0.1,
+            first_steps: 2000,
+            steps: 500,
+            check_every: 50,
+            patience: 10,
+            learn_bounds: false,
+            beta: 0.5,
+            max_target: 10.0,
+            learn_reward: false,
+            gated: false,
+        }
+    }
+}
+
+impl EnsembleConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        for (name, value) in [("members", self.members), ("batch", self.batch), ("check_every", self.check_every)] {
+            if value == 0 {
+                return Err(Error::BadSetting(format!("ensemble: `{name}` must be at least 1")));
+            }
+        }
+        if self.elites == 0 || self.elites > self.members {
+            return Err(Error::BadSetting("ensemble: `elites` must lie between 1 and `members`".into()));
+        }
+        if self.hidden.is_empty() || self.hidden.contains(&0) {
+            return Err(Error::BadSetting("ensemble: `hidden` needs at least one layer, each at least 1 wide".into()));
+        }
+        if !(0.0..0.9).contains(&self.held_out) {
+            return Err(Error::BadSetting("ensemble: `held_out` must lie in [0, 0.9)".into()));
+        }
+        if !(0.0..=1.0).contains(&self.final_learning_rate_fraction) {
+            return Err(Error::BadSetting("ensemble: `final_learning_rate_fraction` must lie in [0, 1]".into()));
+        }
+        Ok(())
+    }
+
+    /// The learning rate at `step` of a fit of `steps`.
+    pub(super) fn learning_rate_at(&self, step: usize, steps: usize) -> f32 {
+        self.learning_rate * (1.0 - (1.0 - self.final_learning_rate_fraction) * step as f32 / steps as f32)
+    }
+}

@@ -1,0 +1,222 @@
+//! Fitting: minibatch gradient descent on the negative log-likelihood, early stopping on the validation set, the choice of
+//! elites, and the temperature of the predicted standard deviations.
+
+use dfdx::prelude::*;
+use dfdx::tensor::Cpu;
+use rand::seq::SliceRandom;
+use rayon::prelude::*;
+
+use super::data::{Data, Schedule};
+use super::{Ensemble, EnsembleConfig};
+use crate::nn::frozen::FrozenMlp;
+use crate::nn::{
+    Activation, Adam, Grad, LogVarianceBounds, Mlp, Tensor3, bounded_nll, ops, parameters_of_fields, values,
+};
+use crate::replay::ReplayBuffer;
+use crate::rng::Rng;
+
+/// Size of the validation set, at most.
+const MAX_HELD_OUT: usize = 2000;
+/// A member has improved when its validation error has fallen by this fraction.
+const IMPROVEMENT: f64 = 0.01;
+/// Fitted temperatures lie between its inverse and this.
+const MAX_TEMPERATURE: f32 = 5.0;
+
+/// How a fit went.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fit {
+    /// Gradient steps of each member.
+    pub steps: usize,
+    /// Training loss, mean over members and steps: negative log-likelihood of the normalised targets, as in
+    /// [`bounded_nll`](crate::nn::bounded_nll).
+    pub loss: f32,
+    /// Validation error of each member: mean squared error of its mean, in normalised units (predicting the mean change
+    /// has error 1). Empty without validation set.
+    pub errors: Vec<f64>,
+}
+
+/// One network of the ensemble with its optimiser. Members share nothing but the data, so they train in parallel.
+#[derive(Clone, Debug)]
+pub(super) struct Member {
+    pub learner: Learner,
+    pub optimiser: Adam,
+}
+
+/// What gradients train: the network, and the bounds of its log-variance. Bounds that are not learned have no gradient.
+#[derive(Clone, Debug)]
+pub(super) struct Learner {
+    pub network: Mlp,
+    pub bounds: LogVarianceBounds,
+}
+
+parameters_of_fields!(Learner: network, bounds);
+
+/// The best weights of a member during a fit.
+struct Best {
+    error: f64,
+    /// None without validation set.
+    learner: Option<Learner>,
+}
+
+impl Default for Best {
+    fn default() -> Self {
+        Self { error: f64::INFINITY, learner: None }
+    }
+}
+
+impl Ensemble {
+    /// Trains on all transitions in `replay`. Weights and optimiser state continue from the fit before; normalisation,
+    /// elites and temperature are computed anew.
+    ///
+    /// # Panics
+    /// If there are fewer than two transitions.
+    #[doc(alias = "negative log-likelihood")]
+    #[doc(alias = "early stopping")]
+    #[doc(alias = "bootstrap")]
+    #[doc(alias = "train")]
+    pub fn fit(&mut self, replay: &ReplayBuffer, rng: &mut Rng) -> Fit {
+        let data = self.normalised(replay);
+        let mut order: Vec<usize> = (0..data.rows).collect();
+        order.shuffle(rng);
+        let held_out = ((self.config.held_out * data.rows as f64) as usize).min(MAX_HELD_OUT);
+        let (validation, training) = order.split_at(held_out);
+        let mut schedules: Vec<Schedule> =
+            (0..self.config.members).map(|_| Schedule::new(training, self.config.bootstrap, rng)).collect();
+
+        let limit = if self.is_fitted() { self.config.steps } else { self.config.first_steps };
+        // The initial weights are no candidates: they may have been trained on what is now the validation set.
+        let mut best: Vec<Best> = (0..self.config.members).map(|_| Best::default()).collect();
+        let (mut steps, mut loss, mut checks_without_improvement) = (0, 0.0, 0);
+        while steps < limit && checks_without_improvement < self.config.patience {
+            let round = steps..limit.min(steps + self.config.check_every);
+            steps = round.end;
+            let rates: Vec<f32> = round.map(|step| self.config.learning_rate_at(step, limit)).collect();
+            loss += self.train(&data, &mut schedules, &rates, rng);
+            if validation.is_empty() {
+                continue;
+            }
+            let mut improved = false;
+            for ((best, error), member) in best.iter_mut().zip(self.errors(&data, validation)).zip(&self.members) {
+                if error < best.error * (1.0 - IMPROVEMENT) {
+                    *best = Best { error, learner: Some(member.learner.clone()) };
+                    improved = true;
+                }
+            }
+            checks_without_improvement = if improved { 0 } else { checks_without_improvement + 1 };
+        }
+        for (member, best) in self.members.iter_mut().zip(&mut best) {
+            if let Some(learner) = best.learner.take() {
+                member.learner = learner;
+            }
+        }
+        self.elites = (0..self.config.members).collect();
+        self.elites.sort_by(|a, b| best[*a].error.total_cmp(&best[*b].error));
+        self.elites.truncate(self.config.elites);
+        let errors = best.iter().map(|best| best.error).filter(|error| error.is_finite()).collect();
+        self.fit_temperature(&data, validation);
+        self.fits += 1;
+        Fit { steps, loss: (loss / (steps.max(1) * self.config.members) as f64) as f32, errors }
+    }
+
+    /// One gradient step of every member for each learning rate, each member on its own minibatches. Returns the sum of
+    /// all losses.
+    fn train(&mut self, data: &Data, schedules: &mut [Schedule], rates: &[f32], rng: &mut Rng) -> f64 {
+        let batch = self.config.batch.min(schedules[0].len());
+        let mut minibatches: Vec<Vec<Vec<usize>>> = vec![vec![]; schedules.len()];
+        for _ in rates {
+            for (minibatches, schedule) in minibatches.iter_mut().zip(schedules.iter_mut()) {
+                minibatches.push(schedule.next(batch, rng));
+            }
+        }
+        let config = &self.config;
+        let members = self.members.par_iter_mut().zip(minibatches);
+        let losses: Vec<f64> = members
+            .map(|(member, minibatches)| {
+                let steps = minibatches.iter().zip(rates);
+                steps.map(|(rows, rate)| f64::from(member.gradient_step(data, rows, *rate, config))).sum()
+            })
+            .collect();
+        losses.iter().sum()
+    }
+
+    /// Mean squared error of each member's mean on the given rows, in normalised units.
+    fn errors(&self, data: &Data, rows: &[usize]) -> Vec<f64> {
+        let (heads, targets) = self.heads_and_targets(data, rows);
+        let outputs = self.temperature.len();
+        let error = |head: &Vec<f32>| {
+            let pairs = head.chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs));
+            let squares =
+                pairs.flat_map(|(head, target)| head.iter().zip(target).map(|(m, t)| f64::from(m - t).powi(2)));
+            squares.sum::<f64>() / targets.len() as f64
+        };
+        heads.iter().map(error).collect()
+    }
+
+    /// Calibration on the validation set: for each output the root mean square of (target - mean) / standard deviation,
+    /// by which predicted standard deviations are multiplied.
+    fn fit_temperature(&mut self, data: &Data, validation: &[usize]) {
+        let outputs = self.temperature.len();
+        if validation.is_empty() {
+            return;
+        }
+        let (heads, targets) = self.heads_and_targets(data, validation);
+        let mut squares = vec![0.0_f64; outputs];
+        for &member in &self.elites {
+            let [max, min] = self.members[member].learner.bounds();
+            for (head, target) in heads[member].chunks_exact(2 * outputs).zip(targets.chunks_exact(outputs)) {
+                for i in 0..outputs {
+                    let log_variance = crate::nn::bounded(head[outputs + i], max[i], min[i]);
+                    squares[i] += f64::from((target[i] - head[i]).powi(2) * (-log_variance).exp());
+                }
+            }
+        }
+        let count = (validation.len() * self.elites.len()) as f64;
+        let root = |sum: &f64| ((sum / count).sqrt() as f32).clamp(1.0 / MAX_TEMPERATURE, MAX_TEMPERATURE);
+        self.temperature = squares.iter().map(root).collect();
+    }
+
+    /// The outputs of each member for some rows, `[rows, 2 outputs]`, and the targets, `[rows, outputs]`.
+    fn heads_and_targets(&self, data: &Data, rows: &[usize]) -> (Vec<Vec<f32>>, Vec<f32>) {
+        let x = data.inputs_of(rows);
+        let head = |member: &Member| values(&member.learner.head(x.clone(), self.config.gated, Grad::Input)).to_vec();
+        (self.members.par_iter().map(head).collect(), values(&data.targets_of(rows)).to_vec())
+    }
+}
+
+impl Member {
+    /// One step of AdamW on a minibatch of rows. Returns the loss.
+    fn gradient_step(&mut self, data: &Data, rows: &[usize], learning_rate: f32, config: &EnsembleConfig) -> f32 {
+        let loss = self.learner.nll(data.inputs_of(rows).leaky_traced(), &data.targets_of(rows), config);
+        let value = values(&loss)[0];
+        self.optimiser.set_learning_rate(learning_rate);
+        self.optimiser.step(&mut self.learner, &mut loss.sum().backward());
+        value
+    }
+}
+
+impl Learner {
+    /// The negative log-likelihood of Gaussians with bounded log-variance (Chua et al. 2018, section 4 and appendix A.1),
+    /// or its beta-NLL variant: see [`bounded_nll`].
+    #[doc(alias = "negative log-likelihood")]
+    fn nll<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, targets: &Tensor3, config: &EnsembleConfig) -> Tensor3<T> {
+        let head = self.head(x, config.gated, Grad::Params);
+        let grad = if config.learn_bounds { Grad::Both } else { Grad::Input };
+        bounded_nll(head, targets, &self.bounds, config.beta, grad)
+    }
+
+    /// Means and raw (not yet bounded) log-variances, `[1, batch, 2 outputs]`.
+    fn head<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, gated: bool, grad: Grad) -> Tensor3<T> {
+        let head = self.network.forward(x, grad);
+        if gated { ops::gated(head) } else { head }
+    }
+
+    /// The network for prediction, and its bounds.
+    pub fn frozen(&self) -> (FrozenMlp, [&[f32]; 2]) {
+        (FrozenMlp::new(self.network.layers_of(0), Activation::Silu), self.bounds())
+    }
+
+    /// Upper and lower bounds of the log-variances.
+    fn bounds(&self) -> [&[f32]; 2] {
+        [values(&self.bounds.max), values(&self.bounds.min)]
+    }
+}

@@ -1,0 +1,32 @@
+//! Feature maps: which features of an observation networks read and predict, and on which scale.
+//!
+//! [`FeatureMap`] serves the ensembles, [`LatentFeatures`] the latent models (autoencoder and RSSM). Both read the
+//! [`crate::env::Role`] of each feature: `Dynamic` features are predicted, `Constant` ones (a goal) are not, and a
+//! `Difference` is recomputed from the two features that it is the difference of. [`Cube`] reduces the orientation of a
+//! cube by its 24 rotational symmetries, and [`Normaliser`] standardises inputs and targets.
+//!
+//! ```
+//! use handful::model::features::FeatureMap;
+//! use handful::prelude::*;
+//!
+//! let mut world = Task::Reach.make();
+//! let map = FeatureMap::new(world.spec())?;
+//! let mut obs = world.reset(0);
+//! // The goal is constant, and the vector to it follows from the hand's position, so neither is predicted.
+//! assert!(map.predicted.len() < map.width);
+//! assert_eq!(map.inputs(&obs).count(), map.input_size());
+//! let unchanged = obs.clone();
+//! map.recompute_derived(&mut obs);
+//! assert!(obs.iter().zip(unchanged).all(|(a, b)| (a - b).abs() < 1e-6));
+//! # Ok::<(), handful::error::Error>(())
+//! ```
+
+mod cube;
+mod feature_map;
+mod latent;
+mod normaliser;
+
+pub use cube::Cube;
+pub use feature_map::FeatureMap;
+pub use latent::LatentFeatures;
+pub use normaliser::Normaliser;

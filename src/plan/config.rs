@@ -1,0 +1,89 @@
+//! The planners of this crate by name, as settings files have them.
+
+use serde::{Deserialize, Serialize};
+
+use super::{
+    Cem, CemConfig, Gradient, GradientConfig, Hybrid, HybridConfig, Icem, IcemConfig, MakePlanner, Mppi, MppiConfig,
+    Planner, RandomShooting, ShootingConfig,
+};
+use crate::error::{Error, Result};
+
+/// A planner of this crate with its settings.
+///
+/// ```
+/// use handful::plan::{MppiConfig, PlannerConfig};
+///
+/// let config: PlannerConfig = toml::from_str("[mppi]\npopulation = 100").expect("a planner and its settings");
+/// assert_eq!(config, PlannerConfig::Mppi(MppiConfig { population: 100, ..MppiConfig::default() }));
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum PlannerConfig {
+    /// Random shooting.
+    Shooting(ShootingConfig),
+    /// The cross-entropy method as in PETS.
+    Cem(CemConfig),
+    /// CEM with coloured noise and a memory.
+    Icem(IcemConfig),
+    /// Model predictive path integral control.
+    Mppi(MppiConfig),
+    /// Gradient ascent from several starts (gradient shooting).
+    Gradient(GradientConfig),
+    /// iCEM, refined by gradient ascent.
+    Hybrid(HybridConfig),
+}
+
+impl PlannerConfig {
+    /// A planner for actions of `action_size` numbers.
+    pub fn build(&self, action_size: usize) -> Box<dyn Planner> {
+        match self {
+            PlannerConfig::Shooting(config) => Box::new(RandomShooting::new(config.clone(), action_size)),
+            PlannerConfig::Cem(config) => Box::new(Cem::new(config.clone(), action_size)),
+            PlannerConfig::Icem(config) => Box::new(Icem::new(config.clone(), action_size)),
+            PlannerConfig::Mppi(config) => Box::new(Mppi::new(config.clone(), action_size)),
+            PlannerConfig::Gradient(config) => Box::new(Gradient::new(config.clone(), action_size)),
+            PlannerConfig::Hybrid(config) => Box::new(Hybrid::new(config.clone(), action_size)),
+        }
+    }
+
+    /// The planning horizon, in actions.
+    pub fn horizon(&self) -> usize {
+        match self {
+            PlannerConfig::Shooting(config) => config.horizon,
+            PlannerConfig::Cem(config) => config.horizon,
+            PlannerConfig::Icem(config) => config.horizon,
+            PlannerConfig::Mppi(config) => config.horizon,
+            PlannerConfig::Gradient(config) => config.horizon,
+            PlannerConfig::Hybrid(config) => config.icem.horizon,
+        }
+    }
+
+    /// # Errors
+    /// If the horizon is shorter than two time steps, or there would be no candidates.
+    pub(crate) fn check(&self) -> Result<()> {
+        let candidates = match self {
+            PlannerConfig::Shooting(config) => config.population,
+            PlannerConfig::Cem(config) => config.population.min(config.elites).min(config.iterations),
+            PlannerConfig::Icem(config) => config.population.min(config.elites).min(config.iterations),
+            PlannerConfig::Mppi(config) => config.population.min(config.iterations),
+            PlannerConfig::Gradient(config) => config.starts,
+            PlannerConfig::Hybrid(HybridConfig { icem, .. }) => icem.population.min(icem.elites).min(icem.iterations),
+        };
+        if self.horizon() < 2 {
+            return Err(Error::BadSetting("planner: `horizon` must be at least 2".into()));
+        }
+        if candidates == 0 {
+            return Err(Error::BadSetting(
+                "planner: population, elites, iterations, starts: at least 1 of each".into(),
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl MakePlanner for PlannerConfig {
+    fn make(&self, action_size: usize) -> Box<dyn Planner> {
+        self.build(action_size)
+    }
+}
