@@ -3,17 +3,18 @@
 //! with finite differences in rapier3d, whose contact is not smooth. `data/contact.csv`, `data/contact-rapier.csv`,
 //! `data/contact.svg`.
 //!
-//! `cargo run --example contact` (three minutes).
+//! `cargo run --example contact` (three minutes); with `-- draw`, only the figure, from the tables that are there.
 
 use std::error::Error;
 
+use handful::chart::{Chart, PALETTE, Panels};
 use handful::diff::derivatives::gradient;
 use handful::diff::pusher::STATE;
 use handful::diff::{Pusher, PusherTask};
 use handful::env::{Env, Snapshot, Task};
 use handful::rng::{self, Rng, uniform};
 use nalgebra::SVector;
-use plotters::prelude::*;
+use plotters::chart::SeriesLabelPosition;
 use rayon::prelude::*;
 
 const STIFFNESS: [f64; 5] = [50.0, 150.0, 500.0, 1500.0, 5000.0];
@@ -25,7 +26,7 @@ const COPIES: usize = 200;
 const SHAKE: f64 = 0.1;
 
 /// A row of the first table; gradients are those of the cost with respect to all actions, means over the pushes.
-#[derive(Clone, serde::Serialize)]
+#[derive(Clone, serde::Deserialize, serde::Serialize)]
 struct Row {
     stiffness: f64,
     horizon: usize,
@@ -193,50 +194,32 @@ fn rapier() -> Result<Vec<RapierRow>, Box<dyn Error>> {
     Ok(rows)
 }
 
-fn draw(rows: &[Row]) -> Result<(), Box<dyn Error>> {
-    let area = SVGBackend::new("data/contact.svg", (820, 400)).into_drawing_area();
-    area.fill(&WHITE)?;
-    let panels = area.split_evenly((1, 2));
-    type Reading = fn(&Row) -> f64;
-    let about: [(&str, Reading, f64); 2] = [
-        ("bias: distance from the smoothed gradient", |row| row.bias, 0.8),
-        ("deviation of one shaken gradient", |row| row.first_order_deviation, 2.4),
-    ];
-    let colours = [RGBColor(0, 114, 178), RGBColor(0, 158, 115), RGBColor(230, 159, 0), RGBColor(213, 94, 0)];
-    for (panel, (title, reading, top)) in panels.iter().zip(about) {
-        let mut chart = ChartBuilder::on(panel)
-            .caption(title, ("sans-serif", 17))
-            .margin(12)
-            .x_label_area_size(42)
-            .y_label_area_size(50)
-            .build_cartesian_2d((40.0..6000.0).log_scale(), 0.0..top)?;
-        chart
-            .configure_mesh()
-            .light_line_style(WHITE)
-            .x_desc("stiffness of contact, N/m")
-            .y_desc("share of the smoothed gradient")
-            .label_style(("sans-serif", 13))
-            .draw()?;
-        for (horizon, colour) in HORIZONS.into_iter().zip(colours) {
+/// Draws the first table.
+fn draw() -> Result<(), Box<dyn Error>> {
+    let rows = csv::Reader::from_path("data/contact.csv")?.into_deserialize().collect::<Result<Vec<Row>, _>>()?;
+    let chart = |title: &str, reading: fn(&Row) -> f64, top: f64| {
+        let mut chart = Chart::new("contact stiffness, N/m", "share of the smoothed gradient")
+            .titled(title)
+            .log_x()
+            .x_between(40.0, 6000.0)
+            .between(0.0, top)
+            .legend(SeriesLabelPosition::UpperRight);
+        for (horizon, colour) in HORIZONS.into_iter().zip([0, 2, 4, 1].map(|i| PALETTE[i])) {
             let line = rows.iter().filter(|row| row.horizon == horizon).map(|row| (row.stiffness, reading(row)));
-            chart
-                .draw_series(LineSeries::new(line, colour.stroke_width(3)))?
-                .label(format!("{horizon} steps"))
-                .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], colour.stroke_width(3)));
+            chart = chart.line(&format!("{horizon} steps"), line).coloured(colour);
         }
         chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::UpperRight)
-            .background_style(WHITE.mix(0.85))
-            .border_style(RGBColor(180, 180, 180))
-            .label_font(("sans-serif", 13))
-            .draw()?;
-    }
-    area.present()?;
-    Ok(())
+    };
+    let panels = Panels::new("Gradients of a push through contact")
+        .panel(chart("bias: distance from the smoothed gradient", |row| row.bias, 0.8))
+        .panel(chart("standard deviation of one noisy gradient", |row| row.first_order_deviation, 2.4));
+    Ok(std::fs::write("data/contact.svg", panels.svg()?)?)
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
+    if std::env::args().nth(1).as_deref() == Some("draw") {
+        return draw();
+    }
     let mut rows = Vec::new();
     for horizon in HORIZONS {
         for stiffness in STIFFNESS {
@@ -260,5 +243,5 @@ fn main() -> Result<(), Box<dyn Error>> {
         writer.serialize(row)?;
     }
     writer.flush()?;
-    draw(&rows)
+    draw()
 }

@@ -1,26 +1,27 @@
 //! Two ways to a policy: SAC, which only sees rewards, and analytic policy gradients, through the simulator itself. Both learn to
 //! swing up the pendulum; returns over simulated steps and over seconds: `data/policies.csv`, `data/policies.svg`.
 //!
-//! `cargo run --example policies` (three minutes).
+//! `cargo run --example policies` (three minutes); with `-- draw`, only the figure, from the table that is there.
 
 use std::error::Error;
 use std::time::{Duration, Instant};
 
 use handful::agent::Mode;
+use handful::chart::{Chart, PALETTE, Panels};
 use handful::diff::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PendulumSwing};
 use handful::env::pendulum::Pendulum;
 use handful::prelude::*;
 use handful::rng;
 
 use nalgebra::SVector;
-use plotters::prelude::*;
+use plotters::chart::SeriesLabelPosition;
 
 const SEEDS: u64 = 3;
 const EPISODES: u64 = 20;
 
-#[derive(serde::Serialize)]
+#[derive(serde::Deserialize, serde::Serialize)]
 struct Row {
-    method: &'static str,
+    method: String,
     seed: u64,
     /// Simulated steps so far.
     steps: usize,
@@ -61,7 +62,7 @@ fn by_gradients(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
         }
         spent += clock.elapsed();
         let total = evaluate(|obs| search.act(&SVector::from_column_slice(obs))[0])?;
-        rows.push(Row { method: "gradients", seed, steps: search.steps, seconds: spent.as_secs_f64(), total });
+        rows.push(Row { method: "gradients".into(), seed, steps: search.steps, seconds: spent.as_secs_f64(), total });
     }
     Ok(())
 }
@@ -94,61 +95,40 @@ fn by_sac(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
         spent += clock.elapsed();
         if steps.is_multiple_of(500) {
             let total = evaluate(|obs| agent.act(obs, Mode::Evaluate)[0])?;
-            rows.push(Row { method: "sac", seed, steps, seconds: spent.as_secs_f64(), total });
+            rows.push(Row { method: "sac".into(), seed, steps, seconds: spent.as_secs_f64(), total });
         }
     }
     Ok(())
 }
 
-fn draw(rows: &[Row]) -> Result<(), Box<dyn Error>> {
-    let area = SVGBackend::new("data/policies.svg", (820, 360)).into_drawing_area();
-    area.fill(&WHITE)?;
-    type Reading = fn(&Row) -> f64;
-    let about: [(&str, Reading, std::ops::Range<f64>); 2] = [
-        ("simulated steps", |row| row.steps as f64, 400.0..250_000.0),
-        ("seconds of learning", |row| row.seconds, 0.03..120.0),
-    ];
-    for (panel, (title, reading, range)) in area.split_evenly((1, 2)).iter().zip(about) {
-        let mut chart = ChartBuilder::on(panel)
-            .margin(12)
-            .x_label_area_size(42)
-            .y_label_area_size(60)
-            .build_cartesian_2d(range.log_scale(), -1700.0..0.0)?;
-        chart
-            .configure_mesh()
-            .light_line_style(WHITE)
-            .x_desc(title)
-            .y_desc("return of 20 episodes")
-            .x_label_formatter(&|x| x.to_string())
-            .y_label_formatter(&|y| format!("{y:.0}"))
-            .label_style(("sans-serif", 13))
-            .draw()?;
-        for (method, name, colour) in
-            [("gradients", "through the simulator", RGBColor(0, 114, 178)), ("sac", "SAC", RGBColor(213, 94, 0))]
-        {
+/// Draws the table.
+fn draw() -> Result<(), Box<dyn Error>> {
+    let rows = csv::Reader::from_path("data/policies.csv")?.into_deserialize().collect::<Result<Vec<Row>, _>>()?;
+    let chart = |label: &str, reading: fn(&Row) -> f64, [first, last]: [f64; 2]| {
+        let mut chart = Chart::new(label, "mean return of 20 episodes")
+            .log_x()
+            .x_between(first, last)
+            .between(-1700.0, 0.0)
+            .legend(SeriesLabelPosition::LowerRight);
+        for (method, name, colour) in [("gradients", "through the simulator", PALETTE[0]), ("sac", "SAC", PALETTE[1])] {
             for seed in 0..SEEDS {
                 let own = rows.iter().filter(|row| row.method == method && row.seed == seed);
-                let line = LineSeries::new(own.map(|row| (reading(row), row.total)), colour.stroke_width(2));
-                let series = chart.draw_series(line)?;
-                if seed == 0 {
-                    series
-                        .label(name)
-                        .legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], colour.stroke_width(3)));
-                }
+                let name = if seed == 0 { name } else { "" };
+                chart = chart.line(name, own.map(|row| (reading(row), row.total))).coloured(colour);
             }
         }
         chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
-            .background_style(WHITE.mix(0.85))
-            .border_style(RGBColor(180, 180, 180))
-            .label_font(("sans-serif", 13))
-            .draw()?;
-    }
-    Ok(area.present()?)
+    };
+    let panels = Panels::new("Pendulum: gradients through the simulator, and SAC")
+        .panel(chart("simulated steps", |row| row.steps as f64, [400.0, 250_000.0]))
+        .panel(chart("seconds of learning", |row| row.seconds, [0.03, 120.0]));
+    Ok(std::fs::write("data/policies.svg", panels.svg()?)?)
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
+    if std::env::args().nth(1).as_deref() == Some("draw") {
+        return draw();
+    }
     let mut rows = Vec::new();
     for seed in 0..SEEDS {
         by_gradients(seed, &mut rows)?;
@@ -169,5 +149,5 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut writer = csv::Writer::from_path("data/policies.csv")?;
     rows.iter().try_for_each(|row| writer.serialize(row))?;
     writer.flush()?;
-    draw(&rows)
+    draw()
 }

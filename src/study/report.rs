@@ -39,24 +39,24 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         write!(text, "\n## {task}\n\n").expect("text grows");
         text += &findings(&tables, task)?;
         if figures::learning_curves(&tables, task, &to.join(&curves))? {
-            write!(text, "\n![Success of each method on {task} over environment steps]({curves})\n")
+            write!(text, "\n![Success rate of each method on {task} over environment steps]({curves})\n")
                 .expect("text grows");
         }
         figures::tests(&tables, task, &to.join(&tests))?;
-        write!(text, "\n![Success and smoothness of each method on {task} in the final test]({tests})\n")
+        write!(text, "\n![Success rate and smoothness of each method on {task} in the final test]({tests})\n")
             .expect("text grows");
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
             let file = format!("{task}-{method}-model.svg");
             if figures::model(&tables, task, method, &to.join(&file))? {
                 write!(
                     text,
-                    "\n![Open-loop error and calibration of the model of {method} on {task} over environment steps]({file})\n"
+                    "\n![Open-loop prediction error and calibration of the model of {method} on {task} over environment steps]({file})\n"
                 )
                 .expect("text grows");
             }
             let file = format!("{task}-{method}-values.svg");
             if figures::values(&tables, task, method, &to.join(&file))? {
-                write!(text, "\n![Predicted and realised discounted return of {method} on {task} over environment steps]({file})\n")
+                write!(text, "\n![Value estimated by {method} on {task} over environment steps, and the return that followed]({file})\n")
                     .expect("text grows");
             }
         }

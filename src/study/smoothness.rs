@@ -1,7 +1,18 @@
 //! Smoothness of a movement: SPARC and LDLJ.
 //!
-//! Both measures are computed on the movement alone, that is, from the first to the last time step at which the hand is
-//! faster than a twentieth of its top speed.
+//! [`of_path`] measures the movement alone: the part between the first and the last time step at which the hand is faster
+//! than a twentieth of its top speed.
+//!
+//! ```
+//! use handful::study::smoothness::of_path;
+//!
+//! // A minimum-jerk movement of 0.3 m along x in 2 s, sampled at 20 Hz.
+//! let position = |tau: f64| 0.3 * (10.0 * tau.powi(3) - 15.0 * tau.powi(4) + 6.0 * tau.powi(5));
+//! let path: Vec<[f64; 3]> = (0..=40).map(|t| [position(f64::from(t) / 40.0), 0.0, 0.0]).collect();
+//! let (sparc, ldlj) = of_path(&path, 0.05).expect("it moves");
+//! assert!((sparc + 1.4).abs() < 0.1, "{sparc}");
+//! assert!(ldlj < 0.0, "{ldlj}");
+//! ```
 
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex;
@@ -13,7 +24,10 @@ const CUT_OFF: f64 = 10.0;
 /// from the first to the last of them whose magnitude is at least this fraction of the largest.
 const THRESHOLD: f64 = 0.05;
 
-/// SPARC and LDLJ of a path of hand positions (m) sampled every `dt` seconds. `None` if the hand does not move.
+/// Smoothness of a path of hand positions (m) sampled every `dt` seconds: [`sparc`] and [`ldlj`], both dimensionless,
+/// nearer to zero for a smoother movement. `None` where nothing moves.
+#[doc(alias = "smoothness")]
+#[doc(alias = "jerk")]
 pub fn of_path(path: &[[f64; 3]], dt: f64) -> Option<(f64, f64)> {
     let velocity: Vec<[f64; 3]> = path.windows(2).map(|p| std::array::from_fn(|i| (p[1][i] - p[0][i]) / dt)).collect();
     let speed: Vec<f64> = velocity.iter().map(norm).collect();
@@ -31,8 +45,14 @@ fn norm(v: &[f64; 3]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
-/// Spectral arc length (SPARC) of a speed profile sampled at `rate` Hz (Balasubramanian et al. 2015). It is dimensionless
-/// and does not depend on amplitude or duration. A minimum-jerk movement has about -1.4; less smooth ones are more negative.
+/// Spectral arc length of a speed profile (m/s) sampled at `rate` Hz: dimensionless, independent of amplitude and
+/// duration. A minimum-jerk movement has about -1.4; less smooth ones are more negative. Tremor below 5 % of the
+/// spectrum's peak goes unseen.
+///
+/// Balasubramanian et al., "On the analysis of movement smoothness", Journal of NeuroEngineering and Rehabilitation 12
+/// (2015), with its cut-off of 10 Hz and threshold of 0.05; the cut-off is never above half the sampling rate here.
+#[doc(alias = "SPARC")]
+#[doc(alias = "spectral arc length")]
 pub fn sparc(speed: &[f64], rate: f64) -> f64 {
     let bins = (speed.len().next_power_of_two() << 4).max(16);
     let mut spectrum: Vec<Complex<f64>> = speed.iter().map(|&v| v.into()).collect();
@@ -51,9 +71,14 @@ pub fn sparc(speed: &[f64], rate: f64) -> f64 {
     -relative[first..=last].windows(2).map(|m| width.hypot(m[1] - m[0])).sum::<f64>()
 }
 
-/// Log dimensionless jerk (LDLJ) of a velocity sampled at `rate` Hz: minus the logarithm of the integrated squared jerk,
-/// scaled so that it does not depend on duration or top speed. A minimum-jerk movement has about -5.3. It is very sensitive
-/// to noise and to the sampling rate: compare only values at equal rates.
+/// Log dimensionless jerk of a velocity (m/s) sampled at `rate` Hz: `-ln(T^3 / v_peak^2 * sum(|jerk|^2) dt)`, with the
+/// duration `T` = samples * dt. A minimum-jerk movement has about -5.3; less smooth ones are more negative. Very sensitive
+/// to noise and to the sampling rate: compare only at equal rates.
+///
+/// Balasubramanian et al. (2015), there of the speed; here the jerk is that of the velocity vector, so that curved
+/// movements count.
+#[doc(alias = "LDLJ")]
+#[doc(alias = "dimensionless jerk")]
 pub fn ldlj(velocity: &[[f64; 3]], rate: f64) -> f64 {
     let dt = 1.0 / rate;
     let duration = velocity.len() as f64 * dt;

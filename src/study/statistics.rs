@@ -1,10 +1,32 @@
-//! Statistics over a few runs: intervals, interquartile mean, learning-curve summaries.
+//! Statistics for few runs: intervals, robust means, learning curves.
+//!
+//! ```
+//! use handful::rng;
+//! use handful::study::statistics::{bootstrap, interquartile_mean, wilson};
+//!
+//! // 18 of 20 test episodes succeed: the success rate may be as low as 70 %.
+//! let [low, high] = wilson(18, 20);
+//! assert!((low - 0.699).abs() < 1e-3 && (high - 0.972).abs() < 1e-3);
+//!
+//! // Success rates of five seeds, one of which failed.
+//! let seeds = [0.95, 0.9, 0.1, 1.0, 0.85];
+//! let iqm = interquartile_mean(&seeds);
+//! let [low, high] = bootstrap(&seeds, interquartile_mean, &mut rng::stream(0, "an example"));
+//! assert!((iqm - 0.9).abs() < 1e-12 && low < iqm && iqm < high);
+//! ```
 
 use rand::RngExt;
 
 use crate::rng::Rng;
 
-/// The 95 % Wilson interval of a success rate, from `successes` in `n` trials.
+/// The 95 % Wilson score interval, `[low, high]`, of a success rate: `successes` out of `n` independent trials.
+/// `[0, 1]` without trials.
+///
+/// Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22 (1927). Unlike the normal
+/// approximation it stays within `[0, 1]` and has a width at 0 and 100 %.
+#[doc(alias = "Wilson interval")]
+#[doc(alias = "confidence interval")]
+#[doc(alias = "binomial proportion")]
 pub fn wilson(successes: usize, n: usize) -> [f64; 2] {
     if n == 0 {
         return [0.0, 1.0];
@@ -17,8 +39,14 @@ pub fn wilson(successes: usize, n: usize) -> [f64; 2] {
     [(centre - half).max(0.0), (centre + half).min(1.0)]
 }
 
-/// The interquartile mean (IQM): the mean after dropping a quarter of the values, rounded down, at each end.
+/// The interquartile mean: the mean of the middle half. A quarter of the values, rounded down, is dropped at each end;
+/// not a number without values.
+///
+/// Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 2021, who recommend
+/// it over the median for few runs. They pool runs of several tasks; here it is taken over the seeds of one task.
 #[doc(alias = "IQM")]
+#[doc(alias = "interquartile mean")]
+#[doc(alias = "trimmed mean")]
 pub fn interquartile_mean(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -26,19 +54,23 @@ pub fn interquartile_mean(values: &[f64]) -> f64 {
     mean(&sorted[drop..sorted.len() - drop])
 }
 
-/// The mean; NaN if there are no values.
+/// The arithmetic mean; not a number without values.
+#[doc(alias = "average")]
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// The population standard deviation (division by n).
+/// The standard deviation of the values themselves: divided by `n`, not by `n - 1`.
 #[doc(alias = "standard deviation")]
+#[doc(alias = "std")]
 pub fn deviation(values: &[f64]) -> f64 {
     let centre = mean(values);
     (values.iter().map(|v| (v - centre).powi(2)).sum::<f64>() / values.len() as f64).sqrt()
 }
 
-/// The Pearson correlation of two lists; 0 if one of them is constant.
+/// Pearson's correlation coefficient of two lists of the same length; 0 if one of them is constant.
+#[doc(alias = "Pearson")]
+#[doc(alias = "correlation coefficient")]
 pub fn correlation(a: &[f64], b: &[f64]) -> f64 {
     let (centre_a, centre_b) = (mean(a), mean(b));
     let products: Vec<f64> = a.iter().zip(b).map(|(a, b)| (a - centre_a) * (b - centre_b)).collect();
@@ -46,7 +78,14 @@ pub fn correlation(a: &[f64], b: &[f64]) -> f64 {
     if spread > 0.0 { mean(&products) / spread } else { 0.0 }
 }
 
-/// A 95 % percentile bootstrap interval of a statistic over runs.
+/// The 95 % percentile-bootstrap interval, `[low, high]`, of a statistic over runs: its 2.5 % and 97.5 % quantiles over
+/// 5000 samples drawn from `values` with replacement.
+///
+/// Efron, "Bootstrap methods: another look at the jackknife", Annals of Statistics 7 (1979); for reinforcement learning,
+/// Agarwal et al. (NeurIPS 2021). With fewer than five values the interval is too narrow.
+#[doc(alias = "bootstrap confidence interval")]
+#[doc(alias = "confidence interval")]
+#[doc(alias = "resampling")]
 pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rng) -> [f64; 2] {
     const DRAWS: usize = 5000;
     let mut drawn: Vec<f64> = (0..DRAWS)
@@ -59,14 +98,21 @@ pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rn
     [0.025, 0.975].map(|q| drawn[(q * (DRAWS - 1) as f64).round() as usize])
 }
 
-/// The area under a success curve divided by its length in steps: the mean success during training.
+/// The area under a success curve (trapezoidal rule) divided by its length in environment steps: the mean success rate
+/// during training.
+#[doc(alias = "AUC")]
+#[doc(alias = "learning curve")]
+#[doc(alias = "sample efficiency")]
 pub fn area_under_curve(steps: &[f64], success: &[f64]) -> f64 {
     let pieces = steps.windows(2).zip(success.windows(2));
     let area: f64 = pieces.map(|(x, y)| (x[1] - x[0]) * (y[0] + y[1]) / 2.0).sum();
     area / (steps.last().unwrap_or(&0.0) - steps.first().unwrap_or(&0.0))
 }
 
-/// The step at which a success curve, interpolated linearly, first reaches `level`; `None` if it never does.
+/// The number of environment steps after which a success curve first reaches `level`, linear between two evaluations;
+/// `None` if it never does.
+#[doc(alias = "sample efficiency")]
+#[doc(alias = "steps to threshold")]
 pub fn steps_to(level: f64, steps: &[f64], success: &[f64]) -> Option<f64> {
     let reached = success.iter().position(|s| *s >= level)?;
     if reached == 0 {

@@ -23,11 +23,11 @@ pub type Curve = (Vec<f64>, Vec<f64>);
 pub struct Tables {
     /// task, method, seed, step, success, ...: one row per evaluation of each learning run.
     pub evaluations: DataFrame,
-    /// task, method, seed, step, horizon, rmse, ...: the open-loop error of each learned model on
+    /// task, method, seed, step, horizon, rmse, ...: the open-loop prediction error of each learned model on
     /// the episodes of each evaluation.
     pub models: DataFrame,
-    /// task, method, seed, step, expected, realised, ...: predicted and realised discounted
-    /// return in each evaluation.
+    /// task, method, seed, step, expected, realised, ...: the estimated value in each
+    /// evaluation, and the discounted return that followed.
     pub values: DataFrame,
     /// task, method, seed, episode, return, success, ...: one row per test episode.
     pub tests: DataFrame,
@@ -143,8 +143,8 @@ impl Tables {
         found().map_err(inside)
     }
 
-    /// A column of `values.csv` over environment steps: for each seed, steps and values. Empty for methods that predict no
-    /// return.
+    /// A column of `values.csv` over environment steps: for each seed, steps and values. Empty for methods that estimate
+    /// no value.
     ///
     /// # Errors
     /// If the table lacks the column.

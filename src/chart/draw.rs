@@ -1,0 +1,191 @@
+//! How a chart is drawn with plotters.
+
+use plotters::coord::Shift;
+use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
+use plotters::element::DashedPathElement;
+use plotters::prelude::*;
+
+use super::{Chart, FONT, GREY, PALETTE, Series, Shape};
+use crate::error::{Error, Result};
+
+/// Where it is drawn.
+pub type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+/// What plotters says when it draws.
+pub type Drawn<T = ()> = std::result::Result<T, Box<dyn std::error::Error>>;
+
+/// A white area of this width and height in pixels.
+pub fn canvas(svg: &mut String, size: (u32, u32)) -> Result<Area<'_>> {
+    let area = SVGBackend::with_string(svg, size).into_drawing_area();
+    area.fill(&WHITE).map_err(|error| failed(error.into()))?;
+    Ok(area)
+}
+
+pub fn failed(error: Box<dyn std::error::Error>) -> Error {
+    Error::Config(format!("chart: {error}"))
+}
+
+/// Prints an SVG as the evcxr kernel expects an image.
+pub fn display(svg: Result<String>) {
+    match svg {
+        Ok(svg) => println!("EVCXR_BEGIN_CONTENT image/svg+xml\n{svg}\nEVCXR_END_CONTENT"),
+        Err(error) => println!("{error}"),
+    }
+}
+
+/// Sizes in pixels.
+pub struct Layout {
+    title: u32,
+    margin: u32,
+    margin_right: u32,
+    x_labels: u32,
+    /// With a name at the axis, and without.
+    y_labels: [u32; 2],
+}
+
+impl Layout {
+    /// Of a chart that is a figure of its own.
+    pub const ALONE: Self = Self { title: 17, margin: 12, margin_right: 24, x_labels: 42, y_labels: [62, 62] };
+    /// Of one of several.
+    pub const PANEL: Self = Self { title: 15, margin: 8, margin_right: 8, x_labels: 40, y_labels: [62, 50] };
+}
+
+impl Chart {
+    pub(super) fn draw<X, Y>(&self, area: &Area, layout: &Layout, x: X, y: Y) -> Drawn
+    where
+        X: AsRangedCoord<Value = f64>,
+        Y: AsRangedCoord<Value = f64>,
+        X::CoordDescType: ValueFormatter<f64>,
+        Y::CoordDescType: ValueFormatter<f64>,
+    {
+        let mut builder = ChartBuilder::on(area);
+        if !self.title.is_empty() {
+            builder.caption(&self.title, (FONT, layout.title));
+        }
+        let mut chart = builder
+            .margin(layout.margin)
+            .margin_right(layout.margin_right)
+            .x_label_area_size(layout.x_labels)
+            .y_label_area_size(layout.y_labels[usize::from(self.y_label.is_empty())])
+            .build_cartesian_2d(x, y)?;
+        let x_range = chart.x_range();
+        chart
+            .configure_mesh()
+            .max_light_lines(0)
+            .bold_line_style(GREY.mix(0.2))
+            .axis_style(GREY)
+            .x_desc(&self.x_label)
+            .y_desc(&self.y_label)
+            .x_labels(self.x_ticks.count)
+            .y_labels(self.y_ticks.count)
+            .x_label_formatter(&|x| (self.x_ticks.text)(*x))
+            .y_label_formatter(&|y| (self.y_ticks.text)(*y))
+            .label_style((FONT, 14))
+            .draw()?;
+        if let Some(mark) = self.mark.filter(|mark| mark.is_finite()) {
+            let ends = [(x_range.start, mark), (x_range.end, mark)];
+            chart.draw_series(DashedLineSeries::new(ends, 7, 5, GREY.stroke_width(1)))?;
+        }
+        let mut colours = PALETTE.into_iter().cycle();
+        let mut colour = PALETTE[0];
+        for Series { name, shape, points, colour: own } in &self.series {
+            if let Some(own) = own {
+                colour = *own;
+            } else if *shape != Shape::Band {
+                colour = colours.next().expect("colours without end");
+            }
+            let points: Vec<(f64, f64)> = points.iter().copied().filter(|point| self.shows(point)).collect();
+            let line = colour.stroke_width(if *shape == Shape::Dashed { 2 } else { 3 });
+            let series = match shape {
+                Shape::Line => chart.draw_series(LineSeries::new(points, line))?,
+                Shape::Dashed => chart.draw_series(DashedLineSeries::new(points, 7, 5, line))?,
+                Shape::Points => {
+                    chart.draw_series(points.into_iter().map(|p| Circle::new(p, 3, colour.mix(0.7).filled())))?
+                }
+                Shape::Band => chart.draw_series([Polygon::new(points, colour.mix(0.2))])?,
+            };
+            if !name.is_empty() {
+                // A short piece of the line, or one point, for the legend.
+                let series = series.label(name);
+                match shape {
+                    Shape::Dashed => {
+                        series.legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 22, y)], 5, 3, line))
+                    }
+                    Shape::Points => series.legend(move |(x, y)| Circle::new((x + 11, y), 3, line.filled())),
+                    Shape::Line | Shape::Band => {
+                        series.legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], line))
+                    }
+                };
+            }
+        }
+        let names = self.series.iter().filter(|series| !series.name.is_empty()).count();
+        if names > 1 || (names == 1 && self.legend.is_some()) {
+            chart
+                .configure_series_labels()
+                .position(self.legend.clone().unwrap_or_else(|| self.emptiest_corner()))
+                .background_style(WHITE.mix(0.85))
+                .border_style(GREY.mix(0.4))
+                .label_font((FONT, 14))
+                .draw()?;
+        }
+        Ok(())
+    }
+
+    /// The corner in which the legend hides the fewest points.
+    fn emptiest_corner(&self) -> SeriesLabelPosition {
+        let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
+        let along = |value: f64, log: bool| if log { value.ln() } else { value };
+        let middle = |values: Vec<f64>| {
+            let (low, high) = (
+                values.iter().copied().fold(f64::INFINITY, f64::min),
+                values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            );
+            (low + high) / 2.0
+        };
+        let x = middle(shown().map(|(x, _)| along(*x, self.x_log)).collect());
+        let y = match usable(self.y_range, self.y_log) {
+            Some((low, high)) => middle([low, high].map(|y| along(y, self.y_log)).to_vec()),
+            None => middle(shown().map(|(_, y)| along(*y, self.y_log)).collect()),
+        };
+        let corners = [
+            (SeriesLabelPosition::UpperRight, true, true),
+            (SeriesLabelPosition::LowerRight, true, false),
+            (SeriesLabelPosition::UpperLeft, false, true),
+            (SeriesLabelPosition::LowerLeft, false, false),
+        ];
+        let inside = |right: bool, up: bool| {
+            let here =
+                |&&(px, py): &&(f64, f64)| (along(px, self.x_log) > x) == right && (along(py, self.y_log) > y) == up;
+            shown().filter(here).count()
+        };
+        let best = corners.into_iter().min_by_key(|(_, right, up)| inside(*right, *up));
+        best.expect("four corners").0
+    }
+}
+
+/// A range that was asked for, if an axis can have it.
+pub fn usable(range: Option<[f64; 2]>, log: bool) -> Option<(f64, f64)> {
+    let [low, high] = range?;
+    let fits = low.is_finite() && high.is_finite() && low != high && (!log || low.min(high) > 0.0);
+    fits.then_some((low, high))
+}
+
+/// The range of the numbers with a small margin, or `None` if there are none.
+pub fn span(numbers: impl Iterator<Item = f64>, log: bool) -> Option<(f64, f64)> {
+    let (low, high) =
+        numbers.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (f64::min(low, x), f64::max(high, x)));
+    if low > high {
+        return None;
+    }
+    if log {
+        return Some((low / 1.1, high * 1.1));
+    }
+    let margin = if high > low { 0.03 * (high - low) } else { high.abs().max(1.0) * 0.1 };
+    Some((low - margin, high + margin))
+}
+
+/// A number with up to four decimals, without trailing zeros.
+pub fn plain(x: f64) -> String {
+    let text = format!("{x:.4}");
+    let text = text.trim_end_matches('0').trim_end_matches('.');
+    if text == "-0" { "0".into() } else { text.into() }
+}

@@ -1,0 +1,93 @@
+use std::path::Path;
+
+use plotters::chart::SeriesLabelPosition;
+use plotters::style::RGBColor;
+
+use super::{Band, Tables, band, means, percent, save, thousands};
+use crate::chart::{Chart, PALETTE, Panels};
+use crate::error::Result;
+
+/// The horizons, in steps, for which a model's open-loop prediction error is drawn.
+const HORIZONS: [u32; 3] = [1, 5, 15];
+
+/// The quality of a method's model over training: its open-loop prediction error at several horizons, and the coverage of
+/// its 90 % interval. Returns `false`, and draws nothing, if the method has no model.
+///
+/// # Errors
+/// If the tables lack a column or the file cannot be written.
+pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<bool> {
+    let (mut errors, mut coverages) = (Vec::new(), Vec::new());
+    for (colour, horizon) in PALETTE.into_iter().zip(HORIZONS) {
+        let error = tables.model_curves(task, method, horizon, "rmse")?;
+        let coverage = tables.model_curves(task, method, horizon, "coverage90")?;
+        if !error.is_empty() {
+            let label = format!("{horizon} step{} ahead", if horizon == 1 { "" } else { "s" });
+            errors.push((colour, label.clone(), band(&error)));
+            coverages.push((colour, label, band(&coverage)));
+        }
+    }
+    if errors.is_empty() {
+        return Ok(false);
+    }
+    let worst = errors.iter().flat_map(|(.., band)| band).map(|(_, [.., high])| *high).fold(1.05, f64::max);
+    let error = over_training("open-loop prediction error (1: predicting no change)", &errors)
+        .between(0.0, worst.min(4.0))
+        .y_ticks(11, tenths)
+        .mark(1.0)
+        .legend(SeriesLabelPosition::UpperRight);
+    let coverage =
+        over_training("coverage of the 90 % interval", &coverages).between(0.0, 1.03).y_ticks(11, percent).mark(0.9);
+    let title = format!("{task}: open-loop predictions of {method} on held-out episodes");
+    save(&Panels::new(&title).panel(error).panel(coverage), path)?;
+    Ok(true)
+}
+
+/// A method's estimated value over training, beside the discounted return that followed. Returns `false`, and draws
+/// nothing, if the method estimates none.
+///
+/// # Errors
+/// If the tables lack a column or the file cannot be written.
+pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<bool> {
+    let curves = |column: &str| tables.value_curves(task, method, column);
+    let (estimated, followed, correlation) = (curves("expected")?, curves("realised")?, curves("correlation")?);
+    if estimated.is_empty() {
+        return Ok(false);
+    }
+    let [estimated, followed, correlation] = [estimated, followed, correlation].map(|curves| band(&curves));
+    let all = estimated.iter().chain(&followed).flat_map(|(_, values)| *values).filter(|value| value.is_finite());
+    let (low, high) = (all.clone().fold(0.0, f64::min), all.fold(0.0, f64::max));
+    let (low, high) = (1.05 * low, 1.05 * high.max(low + 1e-3));
+    let both = [
+        (PALETTE[0], "estimated value".to_string(), estimated),
+        (PALETTE[1], "return that followed".to_string(), followed),
+    ];
+    let means = over_training("mean over time steps", &both)
+        .between(low, high)
+        .y_ticks(11, if high - low < 10.0 { tenths } else { whole });
+    let correlation = [(PALETTE[2], "over time steps".to_string(), correlation)];
+    let correlation =
+        over_training("correlation of the two", &correlation).between(-0.3, 1.03).y_ticks(11, tenths).mark(1.0);
+    let title = format!("{task}: value estimated by {method}, and the discounted return that followed");
+    save(&Panels::new(&title).panel(means).panel(correlation), path)?;
+    Ok(true)
+}
+
+/// The means over the seeds of what changes over training.
+fn over_training(title: &str, lines: &[(RGBColor, String, Band)]) -> Chart {
+    let steps = lines.iter().flat_map(|(.., band)| band).map(|(x, _)| *x);
+    let (first, last) = (steps.clone().fold(f64::INFINITY, f64::min), steps.fold(0.0, f64::max));
+    let chart = Chart::new("environment steps", "")
+        .titled(title)
+        .x_between(first.min(last - 1.0), last)
+        .x_ticks(5, thousands)
+        .legend(SeriesLabelPosition::LowerRight);
+    lines.iter().fold(chart, |chart, (colour, label, band)| chart.line(label, means(band)).coloured(*colour))
+}
+
+fn tenths(y: f64) -> String {
+    format!("{y:.1}")
+}
+
+fn whole(y: f64) -> String {
+    format!("{y:.0}")
+}
