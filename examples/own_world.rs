@@ -1,8 +1,6 @@
 //! A world of one's own, from nothing to a report: a puck, pushed by a force, slides past a post to a goal.
 //! `cargo run --example own_world` compares all agents on it; `... -- train --task puck --method sac` trains one.
 
-use std::process::ExitCode;
-
 use handful::env::{arm::Pose, arm::Primitive, scene::Body};
 use handful::{prelude::*, rng};
 
@@ -23,15 +21,17 @@ pub struct Puck {
     state: PuckState,
 }
 
-impl Puck {
-    pub fn new() -> Self {
+impl Default for Puck {
+    fn default() -> Self {
         let dynamic = ["x", "y", "vx", "vy"].map(Feature::new).into_iter();
         let goal = ["goal x", "goal y"].map(|name| Feature::new(name).constant());
         let way = ["x", "y"].map(|axis| Feature::new(format!("way {axis}")).difference(format!("goal {axis}"), axis));
         let spec = Spec::new("puck", dynamic.chain(goal).chain(way), 2, 50, 0.1);
         Self { spec, state: PuckState::default() }
     }
+}
 
+impl Puck {
     fn observe(&self) -> Vec<f32> {
         let PuckState { position: [x, y], velocity: [vx, vy], goal: [gx, gy], .. } = self.state;
         vec![x, y, vx, vy, gx, gy, gx - x, gy - y]
@@ -109,11 +109,11 @@ impl Snapshot for Puck {
 /// Our tasks and agents, and the puck. A method that differs from a preset is a few lines of TOML.
 pub fn registry() -> Registry {
     Registry::standard()
-        .env(EnvEntry::new("puck", || Ok(Puck::new())).with_known_reward().with_oracle())
+        .env(EnvEntry::new("puck", || Ok(Puck::default())).with_known_reward().with_oracle())
         .preset("pets-learned", "base = \"pets\"\n[pets.ensemble]\nlearn_reward = true\n")
         .quick_study(&["puck"], &["random", "oracle", "pets", "pets-learned", "dreamer", "sac"])
 }
 
-fn main() -> ExitCode {
+fn main() -> std::process::ExitCode {
     handful::cli::main(&registry())
 }

@@ -87,7 +87,7 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
         let ensemble = fitted(EnsembleConfig { learn_bounds, ..config() });
         let dynamics = ensemble.dynamics();
         let mut rng = rng::stream(1, "test");
-        let mut judged = Vec::new();
+        let mut measured = Vec::new();
         for _ in 0..500 {
             let obs = seen(rng::uniform(&mut rng, -0.8, 0.8) as f32, rng::uniform(&mut rng, -0.8, 0.8) as f32);
             let action = rng::uniform(&mut rng, -1.0, 1.0) as f32;
@@ -101,9 +101,9 @@ fn an_ensemble_learns_what_is_law_and_what_is_chance() {
             assert!(said.epistemic[0] < said.aleatoric[0], "with so much data, chance is the greater part");
             let total = (said.aleatoric[0] + said.epistemic[0]).sqrt();
             let outcome = f64::from(step(&obs, action, &mut rng)[0]);
-            judged.push(GaussianForecast { mean: said.mean[0], std: total, outcome });
+            measured.push(GaussianForecast { mean: said.mean[0], std: total, outcome });
         }
-        let inside = coverage(&judged, 0.9);
+        let inside = coverage(&measured, 0.9);
         assert!((0.84..0.97).contains(&inside), "{inside} of the outcomes lie in the interval of 90 %");
     }
 }
@@ -177,10 +177,10 @@ fn a_model_is_judged_over_many_steps() {
     let (_, unseen) = experience(2000, &mut rng);
     let mut ensemble = Ensemble::new(&spec(), config(), &mut rng).expect("usable settings");
     ensemble.fit(&data, &mut rng);
-    let judged = open_loop(&ensemble.dynamics(), &unseen, &mut rng);
-    let horizons: Vec<usize> = judged.iter().map(|row| row.horizon).collect();
+    let measured = open_loop(&ensemble.dynamics(), &unseen, &mut rng);
+    let horizons: Vec<usize> = measured.iter().map(|row| row.horizon).collect();
     assert_eq!(horizons, [1, 2, 5, 10, 15, 25]);
-    for row in judged {
+    for row in measured {
         assert!(row.rmse < 0.5, "better than foreseeing no change: {row:?}");
         assert!((0.75..=1.0).contains(&row.coverage90), "{row:?}");
     }
@@ -210,8 +210,8 @@ fn latent_models_foresee_too() {
     let (_, episodes) = experience(2000, &mut rng);
     let (_, unseen) = experience(500, &mut rng);
     let data = moments(&episodes);
-    let better = |name: &str, judged: Vec<OpenLoop>| {
-        let five = judged.iter().find(|row| row.horizon == 5).expect("five steps");
+    let better = |name: &str, measured: Vec<OpenLoop>| {
+        let five = measured.iter().find(|row| row.horizon == 5).expect("five steps");
         assert!(five.rmse < 0.6, "{name}: better than foreseeing no change: {five:?}");
     };
 
@@ -233,7 +233,7 @@ fn latent_models_foresee_too() {
     }
     better("world model", open_loop(&world, &unseen, &mut rng));
 
-    // What it says of rewards, with open eyes.
+    // The rewards that it predicts after observing each step.
     let episode = &unseen[0];
     let cpu = handful::nn::device();
     let mut belief = world.initial(1);
@@ -385,7 +385,7 @@ fn a_cube_may_lie_on_any_side() {
                 after
             };
             let (expected, other) = (tipped(&after(one)), after(other));
-            // To first order: the axes that are foretold need not stand quite square.
+            // To first order: the axes that are predicted need not be exactly orthogonal.
             for (k, (a, b)) in expected.iter().zip(&other).enumerate() {
                 assert!((a - b).abs() < 2e-3, "{}: {a} as it lies, {b} on its side", spec.observation[k].name);
             }

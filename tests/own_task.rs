@@ -189,3 +189,34 @@ fn what_observations_do_not_tell_can_be_asked() {
     assert!(table.scripted_action(&obs).is_none() && table.scripted_policy().is_none());
     assert!(Task::Pendulum.make().is_known());
 }
+
+/// Registered, it is planned in by the oracle, acted in by its script, trained on, and drawn, all by name.
+#[test]
+fn it_is_run_by_name() {
+    let touch = Touch::new(0.02);
+    let name = touch.name.clone();
+    let registry = Registry::standard()
+        .env(EnvEntry::table_task(touch))
+        .preset("script", "agent = \"scripted\"\nsteps = 0\ntest_episodes = 5\n")
+        .preset(
+            "small",
+            "agent = \"sac\"\nsteps = 120\nevaluation_episodes = 1\ntest_episodes = 2\n[sac]\nhidden = [8]\n",
+        );
+    let folder = tempfile::tempdir().expect("a folder");
+    for method in ["script", "small"] {
+        let config = registry.config(&name, method, 0, None, None).expect("a preset");
+        let mut run = registry.open_run(&config, &folder.path().join(method)).expect("a new run");
+        let test = loop {
+            if let handful::study::run::Event::Tested(test) = run.step().expect("a healthy run") {
+                break test.summary();
+            }
+        };
+        assert!(method == "small" || test.success == 1.0, "the script solves it: {test:?}");
+    }
+    let config = registry.config(&name, "oracle", 0, None, None).expect("a preset");
+    let mut oracle = registry.method(&config).expect("an oracle");
+    let mut evaluator = Evaluator::new(|| registry.make_env(&config)).expect("the task");
+    let evaluation = evaluator.evaluate(&mut oracle, 1, EvalSeeds::Test).expect("valid actions");
+    let first_half = |range: std::ops::Range<usize>| evaluation.episodes[0].rewards[range].iter().sum::<f32>();
+    assert!(first_half(30..60) > first_half(0..30), "it comes nearer");
+}

@@ -50,7 +50,7 @@ fn a_study_of_the_puck_ends_in_a_report() {
     let learned = folder.path().join("puck/pets-learned/seed0");
     let (config, mut method) = registry.trained_method(&learned).expect("a complete run");
     assert_eq!(config.steps, 500);
-    let recording = Recording::of_episode("puck".into(), Puck::new(), &mut method, 0).expect("valid actions");
+    let recording = Recording::of_episode("puck".into(), Puck::default(), &mut method, 0).expect("valid actions");
     assert_eq!(recording.steps(), 50);
     assert!(recording.to_html().contains("\"post\""), "its own bodies are drawn");
     #[cfg(feature = "study")]
@@ -70,7 +70,7 @@ fn the_oracle_brings_the_puck_home() {
     let registry = registry();
     let config = registry.config("puck", "oracle", 0, None, None).expect("a preset");
     let mut oracle = registry.method(&config).expect("an oracle");
-    let mut evaluator = Evaluator::new(|| Ok(Puck::new())).expect("a puck");
+    let mut evaluator = Evaluator::new(|| Ok(Puck::default())).expect("a puck");
     let summary = evaluator.evaluate(&mut oracle, 10, EvalSeeds::Test).expect("valid actions").summary();
     assert!(summary.success > 0.85, "{summary:?}");
 }
@@ -78,7 +78,7 @@ fn the_oracle_brings_the_puck_home() {
 /// What an environment lacks is said by name.
 #[test]
 fn what_is_missing_is_named() {
-    let bare = Registry::standard().env(EnvEntry::new("bare", || Ok(Puck::new())));
+    let bare = Registry::standard().env(EnvEntry::new("bare", || Ok(Puck::default())));
     let refusal = |method: &str| {
         let config = bare.config("bare", method, 0, None, None).expect("a preset");
         bare.method(&config).expect_err("something is missing").to_string()
@@ -86,4 +86,47 @@ fn what_is_missing_is_named() {
     assert!(refusal("oracle").contains("with_oracle"), "{}", refusal("oracle"));
     assert!(refusal("scripted").contains("no scripted policy"), "{}", refusal("scripted"));
     assert!(refusal("pets").contains("learn_reward"), "{}", refusal("pets"));
+}
+
+/// The puck, but after 230 steps its rewards are not numbers.
+struct Broken {
+    puck: Puck,
+    steps: usize,
+}
+
+impl Env for Broken {
+    fn spec(&self) -> &Spec {
+        self.puck.spec()
+    }
+
+    fn reset(&mut self, seed: u64) -> Vec<f32> {
+        self.puck.reset(seed)
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step> {
+        self.steps += 1;
+        let mut step = self.puck.step(action)?;
+        if self.steps > 230 {
+            step.reward = f32::NAN;
+        }
+        Ok(step)
+    }
+}
+
+/// A broken contract is told at once, with its rule, and what was recorded so far is kept.
+#[test]
+fn a_broken_contract_is_told_and_nothing_is_lost() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let sac = "agent = \"sac\"\nsteps = 500\nevaluation_episodes = 1\n[sac]\nhidden = [16]\nwarm_up = 100\n";
+    let registry = Registry::standard()
+        .env(EnvEntry::new("broken", || Ok(Broken { puck: Puck::default(), steps: 0 })))
+        .preset("small", sac);
+    let config = registry.config("broken", "small", 0, None, None).expect("a preset");
+    let run = [(config, folder.path().join("run"))];
+    let problem = carry_out_all(&registry, &run, 1, &Silent, &AtomicBool::new(false)).expect_err("it is broken");
+    assert!(matches!(problem, Error::Contract { .. }), "{problem}");
+    assert!(problem.to_string().contains("reward"), "{problem}");
+    let episodes = std::fs::read_to_string(run[0].1.join("episodes.csv")).expect("the episodes before");
+    assert_eq!(episodes.lines().count(), 1 + 4, "four episodes of 50 steps, and the header");
+    assert!(run[0].1.join("weights.safetensors").exists());
 }

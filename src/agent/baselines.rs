@@ -21,9 +21,12 @@ impl Random {
     }
 }
 
+/// A function from observations to actions.
+type PolicyFunction = dyn Fn(&[f32]) -> Vec<f32> + Send;
+
 /// A hand-written policy.
 pub struct Scripted {
-    policy: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
+    policy: Box<PolicyFunction>,
 }
 
 impl Scripted {

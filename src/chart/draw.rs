@@ -33,7 +33,7 @@ pub fn display(svg: Result<String>) {
 }
 
 /// Sizes in pixels.
-pub struct Layout {
+pub struct Frame {
     title: u32,
     margin: u32,
     margin_right: u32,
@@ -42,7 +42,7 @@ pub struct Layout {
     y_labels: [u32; 2],
 }
 
-impl Layout {
+impl Frame {
     /// Of a chart that is a figure of its own.
     pub const ALONE: Self = Self { title: 17, margin: 12, margin_right: 24, x_labels: 42, y_labels: [62, 62] };
     /// Of one of several.
@@ -50,7 +50,7 @@ impl Layout {
 }
 
 impl Chart {
-    pub(super) fn draw<X, Y>(&self, area: &Area, layout: &Layout, x: X, y: Y) -> Drawn
+    pub(super) fn draw<X, Y>(&self, area: &Area, frame: &Frame, x: X, y: Y) -> Drawn
     where
         X: AsRangedCoord<Value = f64>,
         Y: AsRangedCoord<Value = f64>,
@@ -59,13 +59,13 @@ impl Chart {
     {
         let mut builder = ChartBuilder::on(area);
         if !self.title.is_empty() {
-            builder.caption(&self.title, (FONT, layout.title));
+            builder.caption(&self.title, (FONT, frame.title));
         }
         let mut chart = builder
-            .margin(layout.margin)
-            .margin_right(layout.margin_right)
-            .x_label_area_size(layout.x_labels)
-            .y_label_area_size(layout.y_labels[usize::from(self.y_label.is_empty())])
+            .margin(frame.margin)
+            .margin_right(frame.margin_right)
+            .x_label_area_size(frame.x_labels)
+            .y_label_area_size(frame.y_labels[usize::from(self.y_label.is_empty())])
             .build_cartesian_2d(x, y)?;
         let x_range = chart.x_range();
         chart

@@ -22,7 +22,7 @@ mod panels;
 use plotters::prelude::*;
 
 use crate::error::{Error, Result};
-use draw::{Layout, span, usable};
+use draw::{Frame, span, usable};
 pub use panels::Panels;
 
 /// Colours that colour-blind readers can tell apart (Okabe and Ito).
@@ -190,12 +190,12 @@ impl Chart {
     /// If there is nothing to draw: no finite point (on a logarithmic scale, no positive one).
     pub fn svg(&self) -> Result<String> {
         let mut svg = String::new();
-        self.draw_on(&draw::canvas(&mut svg, (680, 340))?, &Layout::ALONE)?;
+        self.draw_on(&draw::canvas(&mut svg, (680, 340))?, &Frame::ALONE)?;
         Ok(svg)
     }
 
     /// Draws the chart on an area.
-    fn draw_on(&self, area: &draw::Area, layout: &Layout) -> Result<()> {
+    fn draw_on(&self, area: &draw::Area, frame: &Frame) -> Result<()> {
         let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
         let x = usable(self.x_range, self.x_log).or_else(|| span(shown().map(|(x, _)| *x), self.x_log));
         let y = usable(self.y_range, self.y_log).or_else(|| span(shown().map(|(_, y)| *y), self.y_log));
@@ -203,10 +203,10 @@ impl Chart {
             return Err(Error::Config("chart: there is nothing to draw".into()));
         };
         let drawn = match (self.x_log, self.y_log) {
-            (false, false) => self.draw(area, layout, x0..x1, y0..y1),
-            (true, false) => self.draw(area, layout, (x0..x1).log_scale(), y0..y1),
-            (false, true) => self.draw(area, layout, x0..x1, (y0..y1).log_scale()),
-            (true, true) => self.draw(area, layout, (x0..x1).log_scale(), (y0..y1).log_scale()),
+            (false, false) => self.draw(area, frame, x0..x1, y0..y1),
+            (true, false) => self.draw(area, frame, (x0..x1).log_scale(), y0..y1),
+            (false, true) => self.draw(area, frame, x0..x1, (y0..y1).log_scale()),
+            (true, true) => self.draw(area, frame, (x0..x1).log_scale(), (y0..y1).log_scale()),
         };
         drawn.map_err(draw::failed)
     }

@@ -1,4 +1,4 @@
-use super::draw::{self, Drawn, Layout};
+use super::draw::{self, Drawn, Frame};
 use super::{Chart, FONT};
 use crate::error::Result;
 
@@ -34,7 +34,7 @@ impl Panels {
         };
         let body = body().map_err(draw::failed)?;
         for (area, chart) in body.split_evenly((1, self.charts.len().max(1))).iter().zip(&self.charts) {
-            chart.draw_on(area, &Layout::PANEL)?;
+            chart.draw_on(area, &Frame::PANEL)?;
         }
         drop((body, area));
         Ok(svg)

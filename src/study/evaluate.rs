@@ -64,7 +64,7 @@ pub struct Evaluation {
     pub results: Vec<EpisodeResult>,
     /// Time to choose one action at the start of an episode, ms, when asked for one at a time.
     pub action_ms: f64,
-    /// The episodes themselves, for those who judge models by them; not kept on disk.
+    /// The episodes themselves, for the diagnostics of models; not kept on disk.
     #[serde(skip)]
     pub episodes: Vec<Episode>,
 }

@@ -87,7 +87,7 @@ impl StudyPlan {
 pub trait StudyObserver: Sync {
     /// A run begins, or goes on after `done` steps.
     fn started(&self, run: usize, config: &RunConfig, done: usize);
-    /// Something happened in a run that has done so many steps.
+    /// Something happened in a run, after `done` environment steps.
     fn happened(&self, run: usize, config: &RunConfig, done: usize, event: &Event);
 }
 

@@ -8,7 +8,7 @@ use toml::Table;
 
 use super::Registry;
 use crate::agent::{Method, Oracle, OracleConfig, Scripted};
-use crate::env::tabletop::{ObservationKind, TableOptions};
+use crate::env::tabletop::{ObservationKind, TableOptions, TableTask, Tabletop};
 use crate::env::{Env, KnownReward, Snapshot, Task};
 use crate::error::{Error, Result};
 
@@ -92,6 +92,27 @@ impl<E: Env, O: Settings> EnvEntry<E, O> {
     pub fn with_scripted(mut self, policy: impl Fn(&O) -> Result<Scripted> + Send + Sync + 'static) -> Self {
         self.scripted = Some(Arc::new(policy));
         self
+    }
+}
+
+impl EnvEntry<Tabletop, TableOptions> {
+    /// A task of one's own for the arm, with all that our tasks have: a known reward, the oracle, and its scripted policy.
+    pub fn table_task(task: impl TableTask + 'static) -> Self {
+        let task: Arc<dyn TableTask> = Arc::new(task);
+        let make = {
+            let task = task.clone();
+            move |options: &TableOptions| Tabletop::with_shared(task.clone(), *options)
+        };
+        Self::with_options(task.name(), make.clone())
+            .with_known_reward_if(|options| options.observation == ObservationKind::Compact)
+            .with_oracle()
+            .with_scripted(move |options| {
+                let arm = make(options)?;
+                let policy = arm.scripted_policy();
+                policy.map(Scripted::new).ok_or_else(|| {
+                    Error::Config(format!("{} has no scripted policy for these observations", arm.spec().name))
+                })
+            })
     }
 }
 
