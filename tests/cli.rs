@@ -39,7 +39,7 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--methods", "random,petz"], &["unknown method `petz`"]);
     refused(here, &["study", "--seeds", "3..3"], &["no seeds", "3..3"]);
     refused(here, &["study", "--seeds", "0"], &["no seeds"]);
-    refused(here, &["study", "--seeds", "few"], &["--seeds few"]);
+    refused(here, &["study", "--seeds", "few"], &["'few'", "--seeds", "a number of seeds"]);
     refused(here, &["study", "--jobs", "0"], &["--jobs"]);
     refused(here, &["study", "--tasks", "pendulum", "--methods", "scripted"], &["pendulum has no scripted policy"]);
     refused(here, &["watch", "--task", "reach", "--policy", "scriptd"], &["unknown policy `scriptd`", "`scripted`"]);

@@ -44,7 +44,15 @@ enum Command {
 /// Carries out the command that the program was called with. The answer is the program's exit code: 0, 2 after an error,
 /// 130 after an interruption.
 pub fn main(registry: &Registry) -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        // One line, as for all other values that cannot be used.
+        Err(problem) if problem.kind() == clap::error::ErrorKind::ValueValidation => {
+            eprintln!("{}", problem.render().to_string().lines().next().unwrap_or_default());
+            return ExitCode::from(2);
+        }
+        Err(problem) => problem.exit(),
+    };
     let stop = Arc::new(AtomicBool::new(false));
     let outcome = stop_on_ctrl_c(&stop).and_then(|()| match cli.command {
         None => study::run(registry, study::Args::default(), &stop),

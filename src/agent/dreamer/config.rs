@@ -2,10 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::update::PARTS;
 use crate::error::{Error, Result};
 use crate::model::WorldModelConfig;
 use crate::plan::{ControlConfig, PlannerConfig};
+
+/// Parts of a batch, whose gradients are computed in parallel and averaged. A fixed number: results do not depend on the
+/// machine.
+pub(super) const PARTS: usize = 2;
 
 /// Settings of [`super::Dreamer`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -6,16 +6,13 @@ use dfdx::tensor::{Cpu, Gradients};
 use rayon::prelude::*;
 
 use super::actor_critic::{ActorCritic, ImaginedRollout, TargetCritic};
+use super::config::PARTS;
 use super::{Dreamer, DreamerConfig};
 use crate::agent::Losses;
 use crate::model::WorldModel;
 use crate::nn::{Parameters, TapeOps, ops, parameters_of_fields};
 use crate::replay::SequenceBatch;
 use crate::rng::{self, Rng};
-
-/// Parts of a batch, whose gradients are computed in parallel and averaged. A fixed number: results do not depend on the
-/// machine.
-pub(super) const PARTS: usize = 2;
 
 /// All networks. The target network is not trained: it follows the critic.
 #[derive(Clone, Debug)]
