@@ -385,3 +385,40 @@ fn a_damaged_checkpoint_is_named_and_kept() {
     assert!(problem.to_string().contains("state.safetensors"), "{problem}");
     assert_eq!(std::fs::read(&checkpoint).expect("still there").len(), whole.len() / 2);
 }
+
+/// A folder that an earlier version began is resumed: its keys had other names.
+#[test]
+fn renamed_keys_are_understood() {
+    let registry = Registry::standard();
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("old.toml");
+    let old = "[pets]\ntail = 3.0\ncaution = 0.25\ncuriosity = 0.5\nwarm_up_colour = 1.5\npropagation = \"members\"\n\
+               [pets.ensemble]\nanneal = 0.5\n[pets.control]\nhold = 2\n[pets.planner.icem]\ncolour = 1.25\n";
+    std::fs::write(&file, old).expect("a writable folder");
+    let config = registry.config("push", "pets", 0, None, Some(&file)).expect("old keys have new names");
+    let pets: PetsConfig = config.settings().expect("PETS's settings");
+    let PlannerConfig::Icem(icem) = &pets.planner else { panic!("the preset plans with iCEM") };
+    let numbers = [pets.terminal_weight, pets.disagreement_penalty, pets.disagreement_bonus];
+    assert_eq!(numbers, [3.0, 0.25, 0.5]);
+    assert_eq!((pets.warm_up_noise_beta, icem.noise_beta, pets.control.action_repeat), (1.5, 1.25, 2));
+    assert_eq!(pets.ensemble.final_learning_rate_fraction, 0.5);
+    assert_eq!(pets.propagation, handful::model::Propagation::TsInfMean);
+    // As an earlier version wrote it: the same run.
+    let run = folder.path().join("run");
+    drop(open(&config, &run).expect("a new run"));
+    let text = std::fs::read_to_string(run.join("config.toml")).expect("a configuration");
+    assert!(text.contains("disagreement_penalty = 0.25"), "{text}");
+    let names = [
+        ("terminal_weight", "tail"),
+        ("disagreement_penalty", "caution"),
+        ("disagreement_bonus", "curiosity"),
+        ("warm_up_noise_beta", "warm_up_colour"),
+        ("noise_beta", "colour"),
+        ("action_repeat", "hold"),
+        ("final_learning_rate_fraction", "anneal"),
+        ("\"ts-inf-mean\"", "\"members\""),
+    ];
+    let text = names.iter().fold(text, |text, (new, old)| text.replace(new, old));
+    std::fs::write(run.join("config.toml"), text).expect("a writable folder");
+    open(&config, &run).expect("the same run");
+}

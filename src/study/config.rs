@@ -131,8 +131,16 @@ impl RunConfig {
     /// If the settings cannot be written as TOML.
     #[must_use]
     pub fn with_settings<C: Serialize>(self, settings: &C) -> Self {
-        Self { settings: Table::try_from(settings).expect("settings are TOML"), ..self }
+        Self { settings: settings_table(settings), ..self }
     }
+}
+
+/// Settings as a table, by way of their text: there an f32 has its shortest form (0.95, not 0.949999988).
+///
+/// # Panics
+/// If they cannot be written as TOML.
+pub(crate) fn settings_table(settings: &impl Serialize) -> Table {
+    toml::from_str(&toml::to_string(settings).expect("settings are TOML")).expect("what was just written can be read")
 }
 
 /// Keys that had another name in earlier versions, with the table in which they stand.

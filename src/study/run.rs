@@ -1,7 +1,7 @@
 //! One run: a method learns a task, is evaluated on the way and tested at the end; all of it in a folder that survives
 //! crashes and can be resumed.
 //!
-//! The folder holds `config.toml`, the tables of [`records`](super::records), `weights.safetensors`, and
+//! The folder holds `config.toml`, the tables of [`records`], `weights.safetensors`, and
 //! `checkpoint/state.safetensors`, the one file that a resumed run starts from. Every file is written under a temporary
 //! name and renamed.
 

@@ -11,6 +11,7 @@ use crate::agent::{Method, Oracle, OracleConfig, Scripted};
 use crate::env::tabletop::{ObservationKind, TableOptions, TableTask, Tabletop};
 use crate::env::{Env, KnownReward, Snapshot, Task};
 use crate::error::{Error, Result};
+use crate::study::config::settings_table;
 
 /// Settings that are read from TOML and written to it with all defaults filled in.
 pub trait Settings: Serialize + DeserializeOwned + Default + Send + Sync + 'static {}
@@ -119,7 +120,7 @@ impl EnvEntry<Tabletop, TableOptions> {
 /// The table of settings with all defaults filled in.
 pub(super) fn completed<S: Settings>(table: Table) -> Result<Table, toml::de::Error> {
     let settings: S = table.try_into()?;
-    Ok(Table::try_from(settings).expect("settings are TOML"))
+    Ok(settings_table(&settings))
 }
 
 fn parsed<S: Settings>(table: &Table) -> Result<S> {
