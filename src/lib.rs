@@ -16,7 +16,8 @@
 //! for seed in 1..=300 {
 //!     let action = agent.act(&obs, Mode::Explore);
 //!     let Step { observation, reward, terminated, truncated, .. } = env.step(&action)?;
-//!     agent.observe(&Transition { obs, action, reward, next_obs: observation.clone(), terminated, truncated });
+//!     let next_obs = observation.clone();
+//!     agent.observe(&Transition { obs, action, reward, next_obs, terminated, truncated });
 //!     agent.update();
 //!     obs = observation;
 //!     if terminated || truncated {
@@ -57,7 +58,8 @@
 //!     }
 //! }
 //!
-//! let make = || Ok(Line { spec: Spec::new("line", vec![Feature::new("x")], 1, 20, 0.1), x: 0.0, elapsed: 0 });
+//! let spec = Spec::new("line", [Feature::new("x")], 1, 20, 0.1);
+//! let make = || Ok(Line { spec: spec.clone(), x: 0.0, elapsed: 0 });
 //! let mut homing = Scripted::new(|obs| vec![(-5.0 * obs[0]).clamp(-1.0, 1.0)]);
 //! let summary = Evaluator::new(make)?.evaluate(&mut homing, 20, EvalSeeds::Test)?.summary();
 //! assert_eq!(summary.success, 1.0);
