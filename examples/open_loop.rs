@@ -2,7 +2,8 @@
 //! recurrent state-space model on the same ones, and evaluates all three on others: `data/open_loop/TASK.csv` and
 //! `TASK.svg`.
 //!
-//! `cargo run --example open_loop` (a few minutes); with names of tasks as arguments, only those.
+//! `cargo run --example open_loop` (a few minutes); with names of tasks as arguments, only those;
+//! with `-- draw`, only the figures, from the tables that are there.
 
 use std::error::Error;
 use std::path::Path;
@@ -16,6 +17,7 @@ use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
 use handful::replay::{Episode, ReplayBuffer, SequenceReplay, Transition};
 use handful::rng::{self, Rng};
+use plotters::prelude::SeriesLabelPosition;
 
 /// Episodes for training.
 const TRAINING: u64 = 60;
@@ -79,9 +81,9 @@ fn record(task: Task, seeds: std::ops::Range<u64>, rng: &mut Rng) -> Result<Data
 }
 
 /// A row of `TASK.csv`: see [`handful::model::open_loop::OpenLoop`].
-#[derive(serde::Serialize)]
+#[derive(serde::Deserialize, serde::Serialize)]
 struct Row {
-    model: &'static str,
+    model: String,
     horizon: usize,
     rmse: f64,
     rmse_p90: f64,
@@ -110,7 +112,7 @@ fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episode
     for row in open_loop(&WithoutOrientation { model, spec }, episodes, &mut rng::stream(0, "judge")) {
         let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
         println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
-        rows.push(Row { model: name, horizon, rmse, rmse_p90, coverage90 });
+        rows.push(Row { model: name.into(), horizon, rmse, rmse_p90, coverage90 });
     }
 }
 
@@ -148,15 +150,24 @@ fn compare(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let mut writer = csv::Writer::from_path(folder.join(format!("{}.csv", task.name())))?;
     rows.iter().try_for_each(|row| writer.serialize(row))?;
     writer.flush()?;
-    std::fs::write(folder.join(format!("{}.svg", task.name())), chart(&rows).svg()?)?;
+    draw(task, folder)
+}
+
+/// Draws `TASK.csv`.
+fn draw(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
+    let table = csv::Reader::from_path(folder.join(format!("{}.csv", task.name())))?;
+    let rows = table.into_deserialize().collect::<Result<Vec<Row>, _>>()?;
+    std::fs::write(folder.join(format!("{}.svg", task.name())), chart(task, &rows).svg()?)?;
     Ok(())
 }
 
-fn chart(rows: &[Row]) -> Chart {
+fn chart(task: Task, rows: &[Row]) -> Chart {
     let largest = rows.iter().map(|row| row.rmse).fold(1.1, f64::max).min(2.0);
     let chart = Chart::new("time steps ahead, open loop", "error (predicting no change: 1)")
+        .titled(&format!("{task}: open-loop prediction error"))
         .between(0.0, largest)
-        .dashed("no change", [(0.0, 1.0), (25.0, 1.0)]);
+        .legend(SeriesLabelPosition::UpperRight)
+        .mark(1.0);
     ["ensemble", "autoencoder", "rssm"].into_iter().fold(chart, |chart, model| {
         let of_model = rows.iter().filter(|row| row.model == model);
         chart.line(model, of_model.map(|row| (row.horizon as f64, row.rmse)))
@@ -164,7 +175,11 @@ fn chart(rows: &[Row]) -> Chart {
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
+    let folder = Path::new("data/open_loop");
+    if std::env::args().nth(1).as_deref() == Some("draw") {
+        return [Task::Reach, Task::Push].into_iter().try_for_each(|task| draw(task, folder));
+    }
     let named: Result<Vec<Task>, _> = std::env::args().skip(1).map(|name| name.parse()).collect();
     let tasks = Some(named?).filter(|tasks| !tasks.is_empty()).unwrap_or_else(|| vec![Task::Reach, Task::Push]);
-    tasks.into_iter().try_for_each(|task| compare(task, Path::new("data/open_loop")))
+    tasks.into_iter().try_for_each(|task| compare(task, folder))
 }

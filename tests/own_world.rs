@@ -130,3 +130,36 @@ fn a_broken_contract_is_told_and_nothing_is_lost() {
     assert_eq!(episodes.lines().count(), 1 + 4, "four episodes of 50 steps, and the header");
     assert!(run[0].1.join("weights.safetensors").exists());
 }
+
+/// An agent of one's own is a few lines, and enters the protocol by name.
+#[test]
+fn an_agent_of_ones_own_is_trained_by_name() {
+    /// Repeats the action that earned most.
+    struct Copycat {
+        best: (f32, Vec<f32>),
+        rng: handful::rng::Rng,
+    }
+    impl Agent for Copycat {
+        fn act(&mut self, _obs: &[f32], mode: Mode) -> Vec<f32> {
+            let noise = |_| handful::rng::uniform(&mut self.rng, -1.0, 1.0) as f32;
+            if mode == Mode::Evaluate { self.best.1.clone() } else { (0..2).map(noise).collect() }
+        }
+        fn observe(&mut self, transition: &Transition) {
+            if transition.reward > self.best.0 {
+                self.best = (transition.reward, transition.action.clone());
+            }
+        }
+    }
+    impl Checkpoint for Copycat {}
+    impl Diagnostics for Copycat {}
+
+    let registry = registry().agent("copycat", |context, _: NoOptions| {
+        let best = (f32::NEG_INFINITY, vec![0.0; context.spec.action_size]);
+        Ok(Copycat { best, rng: handful::rng::stream(context.seed, "copycat") })
+    });
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = registry.config("puck", "copycat", 0, Some(100), None).expect("a method of its own name");
+    let mut run = registry.open_run(&config, folder.path()).expect("a new run");
+    while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
+    assert!(folder.path().join("test.csv").exists() && folder.path().join("evaluations.csv").exists());
+}
