@@ -1,4 +1,12 @@
 //! What can go wrong, said so that a person can mend it.
+//!
+//! ```
+//! use handful::prelude::*;
+//!
+//! let problem = Registry::standard().config("raech", "sac", 0, None, None).unwrap_err();
+//! assert!(matches!(problem, Error::UnknownName { .. }));
+//! assert!(problem.to_string().starts_with("unknown task `raech` (did you mean `reach`?)"));
+//! ```
 
 use std::path::{Path, PathBuf};
 

@@ -1,4 +1,12 @@
 //! Writing files atomically: whole or not at all.
+//!
+//! ```
+//! let folder = tempfile::tempdir()?;
+//! let path = folder.path().join("new/table.csv");
+//! handful::files::write(&path, b"a,b\n1,2\n")?;
+//! assert_eq!(std::fs::read(&path)?, b"a,b\n1,2\n");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 use std::io::Write;
 use std::path::Path;

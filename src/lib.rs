@@ -92,7 +92,7 @@
 //!   fixes a run bit for bit on one machine.
 //! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
 //! - Libraries return [`error::Error`]s; a panic is a bug.
-#![warn(missing_docs)]
+#![warn(missing_debug_implementations, missing_docs)]
 
 pub mod agent;
 #[cfg(feature = "figures")]

@@ -1,4 +1,16 @@
 //! The evaluation protocol: the same initial states for every method, deterministic actions.
+//!
+//! ```
+//! use handful::prelude::*;
+//!
+//! let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make()))?;
+//! let mut random = Random::new(Task::Pendulum.make().spec(), 0);
+//! let evaluation = evaluator.evaluate(&mut random, 5, EvalSeeds::Test)?;
+//! assert_eq!(evaluation.results.len(), 5);
+//! let summary = evaluation.summary();
+//! assert!(summary.success_low <= summary.success && summary.return_mean < -500.0);
+//! # Ok::<(), Error>(())
+//! ```
 
 use std::time::Instant;
 

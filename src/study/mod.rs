@@ -2,6 +2,40 @@
 //!
 //! [`run::Run`] is one training run in its folder; [`runner`] carries out many; with the feature `study`, [`tables`]
 //! gathers their numbers, and [`figures`] and [`report`] show them.
+//!
+//! ```
+//! use std::sync::atomic::AtomicBool;
+//!
+//! use handful::prelude::*;
+//! use handful::study::config::RunConfig;
+//! use handful::study::run::Event;
+//! use handful::study::runner::{StudyObserver, StudyPlan, carry_out_all};
+//!
+//! struct Silent;
+//! impl StudyObserver for Silent {
+//!     fn started(&self, _run: usize, _config: &RunConfig, _done: usize) {}
+//!     fn happened(&self, _run: usize, _config: &RunConfig, _done: usize, _event: &Event) {}
+//! }
+//!
+//! let folder = tempfile::tempdir().expect("a folder");
+//! let plan = StudyPlan {
+//!     tasks: vec!["cartpole".into()],
+//!     methods: vec!["random".into(), "debug".into()],
+//!     seeds: 0..1,
+//!     folder: folder.path().into(),
+//! };
+//! let registry = Registry::standard();
+//! let runs = plan.runs(&registry)?;
+//! carry_out_all(&registry, &runs, 2, &Silent, &AtomicBool::new(false))?;
+//! # #[cfg(feature = "study")]
+//! # {
+//! let tables = handful::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
+//! tables.write(folder.path())?;
+//! println!("{}", handful::study::report::write(folder.path(), folder.path())?);
+//! assert!(folder.path().join("report.md").exists());
+//! # }
+//! # Ok::<(), Error>(())
+//! ```
 
 pub mod config;
 pub mod evaluate;

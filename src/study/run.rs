@@ -4,6 +4,21 @@
 //! The folder holds `config.toml`, the tables of [`records`], `weights.safetensors`, and
 //! `checkpoint/state.safetensors`, the one file that a resumed run starts from. Every file is written under a temporary
 //! name and renamed.
+//!
+//! ```
+//! use handful::prelude::*;
+//! use handful::study::run::Event;
+//!
+//! let registry = Registry::standard();
+//! let config = registry.config("pendulum", "debug", 0, None, None)?;
+//! let folder = tempfile::tempdir().expect("a folder");
+//! // The same call resumes the run, should it have been stopped.
+//! let mut run = registry.open_run(&config, folder.path())?;
+//! while !matches!(run.step()?, Event::Tested(_)) {}
+//! let (_, mut method) = registry.trained_method(folder.path())?;
+//! assert!(method.as_learner().is_some());
+//! # Ok::<(), Error>(())
+//! ```
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -51,6 +66,14 @@ pub struct Run<E> {
     evaluated_at: Option<usize>,
     clock: Instant,
     last_save: Instant,
+}
+
+impl<E> std::fmt::Debug for Run<E> {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let Self { config, folder, progress, .. } = self;
+        let mut run = f.debug_struct("Run");
+        run.field("config", config).field("folder", folder).field("step", &progress.step).finish_non_exhaustive()
+    }
 }
 
 impl<E: Env> Run<E> {

@@ -1,5 +1,16 @@
 //! An episode as one HTML file with a 3D replay: it opens from the disk and asks nothing of the
 //! network. `README.md` beside this file tells what its parts are.
+//!
+//! ```
+//! use handful::prelude::*;
+//! use handful::watch::Recording;
+//!
+//! let mut random = Random::new(Task::Pendulum.make().spec(), 0);
+//! let recording = Recording::of_episode("random torques".into(), Task::Pendulum.make(), &mut random, 0)?;
+//! assert_eq!(recording.steps(), 200);
+//! assert!(recording.to_html().contains("<title>"));
+//! # Ok::<(), Error>(())
+//! ```
 
 use std::path::Path;
 

@@ -39,6 +39,12 @@ pub struct EnvEntry<E, O = NoOptions> {
     env: PhantomData<fn() -> E>,
 }
 
+impl<E, O> std::fmt::Debug for EnvEntry<E, O> {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.debug_struct("EnvEntry").field("name", &self.name).finish_non_exhaustive()
+    }
+}
+
 impl<E: Env> EnvEntry<E> {
     /// An environment without options.
     pub fn new(name: &str, make: impl Fn() -> Result<E> + Send + Sync + 'static) -> Self {
