@@ -77,8 +77,8 @@ impl Env for Puck {
     }
 
     fn scene(&self) -> Vec<Body> {
-        let solid = |name, radius| Body::solid(name, "#d8443c", vec![Primitive::ball(radius, [0.0; 3])]);
-        vec![solid("post", POST.into()), solid("hand", 0.05), Body::goal(TOLERANCE.into())]
+        let ball = |name, colour, radius| Body::solid(name, colour, vec![Primitive::ball(radius, [0.0; 3])]);
+        vec![ball("post", "#c9a97c", POST.into()), ball("hand", "#d8443c", 0.05), Body::goal(TOLERANCE.into())]
     }
 
     fn poses(&self) -> Vec<Pose> {
