@@ -83,6 +83,7 @@ pub trait OpenLoopModel {
 
 /// Evaluates a model on held-out episodes, one row for each of the [`HORIZONS`] that is no longer than the longest
 /// episode; no rows without episodes.
+#[doc(alias = "open loop")]
 pub fn open_loop(model: &impl OpenLoopModel, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
     let longest = episodes.iter().map(|episode| episode.actions.len()).max().unwrap_or(0);
     let horizons: Vec<usize> = HORIZONS.into_iter().filter(|k| *k <= longest).collect();

@@ -97,8 +97,10 @@ impl RssmConfig {
 #[derive(Clone, Debug)]
 pub struct Latent {
     /// The deterministic state h, `[1, rows, deter]`.
+    #[doc(alias = "deterministic state")]
     pub deter: Tensor3,
     /// The stochastic state z, one-hot for each categorical variable, `[1, rows, stoch x classes]`.
+    #[doc(alias = "stochastic state")]
     pub stoch: Tensor3,
 }
 

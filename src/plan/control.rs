@@ -103,6 +103,9 @@ impl RecedingHorizon {
     ///
     /// # Panics
     /// If the planner's plan is shorter than `replan_every` actions.
+    // On a method: the search of rustdoc does not find aliases of re-exported items.
+    #[doc(alias = "MPC")]
+    #[doc(alias = "model predictive control")]
     pub fn act(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Vec<f32> {
         if self.queue.is_empty() {
             let ControlConfig { action_repeat, replan_every } = self.config;

@@ -141,6 +141,7 @@ impl Sac {
     /// One update on a random minibatch: of the critics and their target network, and, when it is due, of policy and
     /// temperature. Returns `critic_loss`, `q` (the critics' mean value), and of the policy `policy_loss`, `entropy` (of the
     /// actions, in nats) and `temperature`; `critic_gradient` and `policy_gradient` are norms before clipping.
+    #[doc(alias = "Bellman")]
     pub fn learn(&mut self) -> Losses {
         let batch = self.replay.sample(self.config.batch, &mut self.rng);
         let mut losses = self.update_critics(&batch);
