@@ -1,6 +1,6 @@
 //! An environment of one's own enters everything: agents, evaluation, the oracle, replays, studies.
 
-#[path = "../examples/own_world.rs"]
+#[path = "../../examples/own_world.rs"]
 #[allow(dead_code)] // its `main`
 mod own_world;
 
