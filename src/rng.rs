@@ -17,6 +17,11 @@
 //! let mut restored = rng::from_state(&rng::state(&exploration));
 //! assert_eq!(rng::normal(&mut restored), rng::normal(&mut exploration));
 //! ```
+//!
+//! The environment variable [`SHAKE`] moves all streams at once. With it every test and chapter becomes an experiment: does
+//! its claim hold for other seeds as well?
+
+use std::sync::OnceLock;
 
 use rand::{RngExt, SeedableRng};
 
@@ -24,9 +29,30 @@ use rand::{RngExt, SeedableRng};
 #[doc(alias = "seed")]
 pub type Rng = rand_xoshiro::Xoshiro256PlusPlus;
 
+/// The environment variable that moves every random stream of the process to other seeds: `HANDFUL_SHAKE=7 cargo test` runs
+/// all tests and chapters with other random numbers. Unset or 0, the streams are those of the published results.
+pub const SHAKE: &str = "HANDFUL_SHAKE";
+
+/// The value of [`SHAKE`], read once.
+///
+/// # Panics
+/// If it is not a whole number below 2^16.
+pub fn shake() -> u64 {
+    static VALUE: OnceLock<u64> = OnceLock::new();
+    *VALUE.get_or_init(|| match std::env::var(SHAKE) {
+        Err(std::env::VarError::NotPresent) => 0,
+        value => {
+            let number = value.as_ref().ok().and_then(|value| value.parse::<u16>().ok());
+            u64::from(number.unwrap_or_else(|| panic!("{SHAKE} must be a whole number from 0 to 65535, not {value:?}")))
+        }
+    })
+}
+
 /// The generator for `purpose` in a run with this `seed`. Different purposes give independent streams. Old checkpoints and
 /// published numbers depend on these strings.
 pub fn stream(seed: u64, purpose: &str) -> Rng {
+    // Seeds of runs and episodes lie below 2^48, so a shake never moves one onto another.
+    let seed = seed.wrapping_add(shake() << 48);
     // FNV-1a, because the standard library's hash may change between versions.
     let hash = purpose
         .bytes()

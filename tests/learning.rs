@@ -296,6 +296,28 @@ fn so_does_one_that_dreams() {
     ends_as_if_it_had_never_stopped(&planning.with_settings(&dreamer), &files);
 }
 
+/// With any number of threads. The digests that this test prints are also the same for the kernels with and without AVX-512,
+/// which `.ci/run` compares.
+#[test]
+fn training_computes_the_same_bits_with_any_number_of_threads() {
+    let mut dreamer = small_dreamer(9);
+    let mut settings: DreamerConfig = dreamer.settings().expect("Dreamer's settings");
+    // Sums over the rows of a batch that are longer than those that a matrix product adds up in one go.
+    (settings.batch, settings.length, settings.train_ratio) = (16, 40, 20.0);
+    dreamer = dreamer.with_settings(&settings);
+    for config in [debug_run(9), small_pets(9), dreamer] {
+        let weights = [1, 2, 4].map(|threads| {
+            let folder = tempfile::tempdir().expect("a folder");
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            pool.install(|| finish(&mut open(&config, folder.path()).expect("a new run")));
+            std::fs::read(folder.path().join("weights.safetensors")).expect("weights")
+        });
+        assert!(weights[0] == weights[1] && weights[0] == weights[2], "{}: 1, 2 and 4 threads", config.method);
+        let mix = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3);
+        println!("bits of {}: {:016x}", config.method, weights[0].iter().fold(0xcbf2_9ce4_8422_2325, mix));
+    }
+}
+
 fn ends_as_if_it_had_never_stopped(config: &RunConfig, files: &[&str]) {
     let folder = tempfile::tempdir().expect("a folder");
     let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));

@@ -1,4 +1,4 @@
-//! The press: `cargo book build`, `serve`, `notebooks`, `check`.
+//! The press: `cargo book build`, `serve`, `notebooks`, `check`, `format`, `census`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail};
 use clap::Parser;
 use handful_book::chapter::Chapter;
 use handful_book::page::Page;
-use handful_book::{format, links, notebook};
+use handful_book::{census, format, links, notebook};
 use mdbook_driver::MDBook;
 use mdbook_preprocessor::book::{Book, BookItem};
 use mdbook_preprocessor::{Preprocessor, PreprocessorContext};
@@ -36,6 +36,12 @@ enum Press {
     Check,
     /// Format the cells of all chapters
     Format,
+    /// Run all tests under other seeds, and write how many of them hold into the book (hours)
+    Census {
+        /// Under how many
+        #[arg(long, default_value_t = 20)]
+        shakes: u16,
+    },
 }
 
 fn main() -> Result<()> {
@@ -46,6 +52,7 @@ fn main() -> Result<()> {
         Press::Notebooks { names } => notebooks(&root, &names),
         Press::Check => check(&root),
         Press::Format => format(&root),
+        Press::Census { shakes } => census::take(&root, shakes),
     }
 }
 

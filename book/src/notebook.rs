@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::chapter::{Chapter, Part};
 
 /// The first cell of every notebook: its dependencies, without the crates that only a study needs.
-pub const SETUP: &str = ":cache 4000\n:dep handful = { path = \"..\", default-features = false, features = [\"figures\"] }\n:dep nalgebra = \"0.35\"\n";
+pub const SETUP: &str = ":cache 4000\n:dep handful = { path = \"..\", default-features = false, features = [\"avx512\", \"figures\"] }\n:dep nalgebra = \"0.35\"\n";
 
 /// The output of a cell.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

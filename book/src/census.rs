@@ -1,0 +1,204 @@
+//! The census of claims: every test under many shakes of its random streams, and how often each held.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+use std::fs;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail, ensure};
+use serde_json::Value;
+
+/// The page that holds the table, between two comments.
+const PAGE: &str = "chapters/notes/census.md";
+const BEGIN: &str = "<!-- census: written by `cargo book census` -->";
+const END: &str = "<!-- end of the census -->";
+
+/// A test program that cargo has built.
+struct Program {
+    /// Its source, relative to the repository.
+    source: String,
+    file: PathBuf,
+    /// Where cargo runs it.
+    folder: PathBuf,
+}
+
+/// How a test fared over the shakes: which of them broke it, and where.
+#[derive(Default)]
+struct Record {
+    shakes: usize,
+    failures: BTreeMap<u16, String>,
+}
+
+type Records = BTreeMap<(String, String), Record>;
+
+/// Runs every test under the shakes `1..=shakes`, with the AVX-512 kernels and with those for AVX2, and writes the table. What
+/// was run before with the same programs is not run again. A failure ends the command with an error, after the table is written.
+pub fn take(root: &Path, shakes: u16) -> Result<()> {
+    let began = Instant::now();
+    let mut columns = Vec::new();
+    for (kernels, features) in [("AVX-512", "avx512,cli,study"), ("AVX2", "cli,study")] {
+        let mut records = Records::new();
+        for program in build(root, features)? {
+            for shake in 1..=shakes {
+                let output = output(root, &program, shake)?;
+                count(&mut records, &program.source, shake, &output)?;
+            }
+        }
+        columns.push((kernels, records));
+    }
+    let path = root.join(PAGE);
+    let page = fs::read_to_string(&path).context(PAGE)?;
+    let (before, rest) = page.split_once(BEGIN).with_context(|| format!("{PAGE} lacks `{BEGIN}`"))?;
+    let (_, after) = rest.split_once(END).with_context(|| format!("{PAGE} lacks `{END}`"))?;
+    fs::write(&path, format!("{before}{BEGIN}\n\n{}\n{END}{after}", table(&columns)))?;
+    println!("{PAGE} written; {:.0} minutes", began.elapsed().as_secs_f64() / 60.0);
+    let failed: Vec<String> = columns.iter().flat_map(|(kernels, records)| failures(kernels, records)).collect();
+    ensure!(failed.is_empty(), "not every claim holds:\n{}", failed.join("\n"));
+    Ok(())
+}
+
+/// Builds all tests but those of the documentation, into a folder for these features.
+fn build(root: &Path, features: &str) -> Result<Vec<Program>> {
+    let output = Command::new("cargo")
+        .args(["test", "--locked", "--no-run", "--lib", "--bins", "--tests", "--message-format=json"])
+        .args(["--no-default-features", "--features", features])
+        .current_dir(root)
+        .stderr(std::process::Stdio::inherit())
+        .output()
+        .context("cargo could not be started")?;
+    ensure!(output.status.success(), "the tests cannot be built");
+    let mut programs = Vec::new();
+    for line in String::from_utf8(output.stdout)?.lines() {
+        let message: Value = serde_json::from_str(line)?;
+        if message["profile"]["test"] != true {
+            continue;
+        }
+        let (Some(file), Some(source)) = (message["executable"].as_str(), message["target"]["src_path"].as_str())
+        else {
+            continue;
+        };
+        let manifest = Path::new(message["manifest_path"].as_str().context("a manifest")?);
+        let source = Path::new(source).strip_prefix(root).unwrap_or(Path::new(source)).display().to_string();
+        programs.push(Program { source, file: file.into(), folder: manifest.parent().context("a folder")?.into() });
+    }
+    programs.sort_by(|a, b| a.source.cmp(&b.source));
+    Ok(programs)
+}
+
+/// What a program prints under a shake; from the last census, if it has not changed since.
+fn output(root: &Path, program: &Program, shake: u16) -> Result<String> {
+    let mut hash = DefaultHasher::new();
+    fs::read(&program.file)?.hash(&mut hash);
+    let kept = root.join(format!("target/census/{:016x}-{shake}.txt", hash.finish()));
+    if let Ok(output) = fs::read_to_string(&kept) {
+        return Ok(output);
+    }
+    let began = Instant::now();
+    let output = Command::new(&program.file)
+        .env("HANDFUL_SHAKE", shake.to_string())
+        .env("RUST_BACKTRACE", "0")
+        .current_dir(&program.folder)
+        .output()
+        .with_context(|| program.file.display().to_string())?;
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    println!("{} under shake {shake}: {}, {:.0} s", program.source, output.status, began.elapsed().as_secs_f64());
+    fs::create_dir_all(root.join("target/census"))?;
+    fs::write(&kept, &text)?;
+    Ok(text)
+}
+
+/// Adds the results in the output of a test program to the records.
+fn count(records: &mut Records, source: &str, shake: u16, output: &str) -> Result<()> {
+    if !output.contains("\ntest result: ") {
+        bail!("{source} broke off under shake {shake}:\n{output}");
+    }
+    for line in output.lines() {
+        let Some((test, outcome)) = line.strip_prefix("test ").and_then(|line| line.split_once(" ... ")) else {
+            continue;
+        };
+        let record = records.entry((source.into(), test.into())).or_default();
+        record.shakes += usize::from(outcome != "ignored");
+        if outcome == "FAILED" {
+            record.failures.insert(shake, reason(output, test));
+        }
+    }
+    Ok(())
+}
+
+/// Where a test failed, and with which message.
+fn reason(output: &str, test: &str) -> String {
+    let details = output.split_once(&format!("---- {test} stdout ----\n")).map_or("", |(_, details)| details);
+    let details = details.split("\n---- ").next().unwrap_or_default();
+    let mut lines = details.lines().skip_while(|line| !line.contains("panicked at "));
+    let place = lines.next().and_then(|line| line.split("panicked at ").nth(1)).unwrap_or("an unknown place:");
+    let place = place.rsplit('/').next().unwrap_or(place);
+    format!("{place} {}", lines.next().unwrap_or_default())
+}
+
+fn failures(kernels: &str, records: &Records) -> Vec<String> {
+    let of_test = |((source, test), record): (&(String, String), &Record)| -> Vec<String> {
+        let line = |(shake, why): (&u16, &String)| format!("{kernels}, HANDFUL_SHAKE={shake}: {source}, {test}: {why}");
+        record.failures.iter().map(line).collect()
+    };
+    records.iter().flat_map(of_test).collect()
+}
+
+/// One row for each test of `tests/` and each chapter, one for all unit tests of a program.
+fn table(columns: &[(&str, Records)]) -> String {
+    let names: Vec<&str> = columns.iter().map(|(kernels, _)| *kernels).collect();
+    let mut text = format!("| test | {} |\n| --- |{}\n", names.join(" | "), " --- |".repeat(names.len()));
+    let tests: BTreeSet<&(String, String)> = columns.iter().flat_map(|(_, records)| records.keys()).collect();
+    let programs: BTreeSet<&String> = tests.iter().map(|(source, _)| source).collect();
+    for program in programs {
+        let of_program: Vec<&String> =
+            tests.iter().filter(|(source, _)| source == program).map(|(_, test)| test).collect();
+        let rows: Vec<(String, Vec<&String>)> = if program.contains("tests/") {
+            of_program.into_iter().map(|test| (format!("{program}: `{test}`"), vec![test])).collect()
+        } else {
+            vec![(format!("{program}: {} unit tests", of_program.len()), of_program)]
+        };
+        for (label, tests) in rows {
+            let cells = columns.iter().map(|(_, records)| {
+                let records = tests.iter().filter_map(|test| records.get(&(program.clone(), (*test).clone())));
+                let (mut all, mut failed) = (0, BTreeSet::<u16>::new());
+                for record in records {
+                    all = all.max(record.shakes);
+                    failed.extend(record.failures.keys());
+                }
+                format!("{} of {all}", all - failed.len())
+            });
+            let _ = writeln!(text, "| {label} | {} |", cells.collect::<Vec<_>>().join(" | "));
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A program that fails one of its tests under one of two shakes.
+    #[test]
+    fn failures_are_counted_and_located() {
+        let good = "\nrunning 2 tests\ntest learns ... ok\ntest plans ... ok\n\ntest result: ok. 2 passed\n";
+        let bad = "\nrunning 2 tests\ntest learns ... FAILED\ntest plans ... ok\n\nfailures:\n\n---- learns stdout ----\n\n\
+                   thread 'learns' (1) panicked at tests/learning.rs:98:5:\nmean return -300\nnote: run with\n\n\
+                   failures:\n    learns\n\ntest result: FAILED. 1 passed; 1 failed\n";
+        let mut records = Records::new();
+        count(&mut records, "tests/learning.rs", 1, good).expect("a whole output");
+        count(&mut records, "tests/learning.rs", 2, bad).expect("a whole output");
+        assert_eq!(
+            failures("AVX2", &records),
+            ["AVX2, HANDFUL_SHAKE=2: tests/learning.rs, learns: learning.rs:98:5: mean return -300"]
+        );
+        let table = table(&[("AVX2", records)]);
+        assert!(
+            table.contains("| tests/learning.rs: `learns` | 1 of 2 |\n| tests/learning.rs: `plans` | 2 of 2 |"),
+            "{table}"
+        );
+        assert!(count(&mut Records::new(), "tests/learning.rs", 3, "\ntest learns ... ok\n").is_err(), "it broke off");
+    }
+}
