@@ -48,6 +48,7 @@ pub mod report;
 pub mod run;
 pub mod runner;
 pub mod smoothness;
+pub mod starts;
 pub mod statistics;
 #[cfg(feature = "study")]
 pub mod tables;
