@@ -51,4 +51,6 @@ pub mod smoothness;
 pub mod starts;
 pub mod statistics;
 #[cfg(feature = "study")]
+mod summary;
+#[cfg(feature = "study")]
 pub mod tables;
