@@ -130,8 +130,10 @@ fn censored_times() {
     let (ratio, [low, high]) =
         ratio_of_means(&[60.0, 80.0, 100.0, 120.0, 150.0], &[40.0, 50.0, 50.0, 70.0, 90.0], &mut rng);
     near("ratio", ratio, 1.7, 1e-12);
-    near("low", low, 1.154, 0.01);
-    near("high", high, 2.458, 0.01);
+    // Exact, over all samples: 1.154 and 2.458. With 10,000 draws, a quantile's share of the distribution has a standard
+    // deviation of 0.0016, which is 0.02 of a ratio at the upper end.
+    near("low", low, 1.154, 0.02);
+    near("high", high, 2.458, 0.05);
 }
 
 /// One agent's test: so many successes in 20 episodes.
@@ -170,17 +172,17 @@ fn t_intervals() {
 fn paired_differences() {
     let half: Vec<f64> = (0..20).map(|i| f64::from(i % 2)).collect();
     let (all, none) = (vec![1.0; 20], vec![0.0; 20]);
-    let check = |what: &str, first: &[Vec<f64>], second: &[Vec<f64>], expected: [f64; 3]| {
-        let (middle, [low, high]) = paired_difference(first, second, &mut rng::stream(0, "pairs"));
+    let check = |what: &str, first: Vec<Vec<f64>>, second: Vec<Vec<f64>>, expected: [f64; 3]| {
+        let (middle, [low, high]) = paired_difference(&first, &second, &mut rng::stream(0, "pairs"));
         [middle, low, high].iter().zip(expected).for_each(|(ours, theirs)| near(what, *ours, theirs, 1e-12));
     };
     // Whichever starts are drawn, there is no difference.
-    check("failures from the same starts", &[half.clone()], &[half.clone(), half.clone()], [0.0, 0.0, 0.0]);
+    check("failures from the same starts", vec![half.clone()], vec![half.clone(), half.clone()], [0.0, 0.0, 0.0]);
     // The second's successes among 20 drawn starts are binomial: 6 to 14.
-    check("one agent each", &[all.clone()], &[half], [0.5, 0.3, 0.7]);
+    check("one agent each", vec![all.clone()], vec![half], [0.5, 0.3, 0.7]);
     // 0, 1 or 2 of 2 drawn seeds fail, in 1, 2 and 1 of 4 cases.
-    check("seeds that differ", &[all.clone()], &[all.clone(), none.clone()], [0.5, 0.0, 1.0]);
-    check("starts that one of them met", &[[all, vec![0.0; 30]].concat()], &[none], [1.0, 1.0, 1.0]);
+    check("seeds that differ", vec![all.clone()], vec![all.clone(), none.clone()], [0.5, 0.0, 1.0]);
+    check("starts that one of them met", vec![[all, vec![0.0; 30]].concat()], vec![none], [1.0, 1.0, 1.0]);
 }
 
 /// A study by hand: `dreamer` with five seeds, one of which fails, `pets` with two, `sac` with one.
@@ -248,7 +250,7 @@ fn a_summary_says_what_its_seeds_can_tell() {
 
 #[test]
 fn sets_of_starts_share_no_seed() {
-    let [last_seed, last_episode] = [LIMIT - 1, LIMIT as usize - 1];
+    let (last_seed, last_episode) = (LIMIT - 1, LIMIT as usize - 1);
     let ends = |from: Result<u64>, to: Result<u64>| [from.expect("in range"), to.expect("in range")];
     let of = |seeds: EvalSeeds| ends(seeds.seed(0), seeds.seed(last_episode));
     let users = ends(EvalSeeds::Seed(0).seed(0), EvalSeeds::Seed(last_seed).seed(last_episode));

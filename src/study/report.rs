@@ -165,22 +165,33 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
 /// The comparison of a method with [`BASELINE`], if both learn the task.
 fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<String> {
     let value = |column: &str| tables.value(task, method, column);
-    let of_baseline = |column: &str| tables.value(task, BASELINE, column);
-    let three = |column: &str| -> Result<Option<[f64; 3]>> {
-        let ends = (value(column)?, value(&format!("{column}_low"))?, value(&format!("{column}_high"))?);
-        Ok(if let (Some(middle), Some(low), Some(high)) = ends { Some([middle, low, high]) } else { None })
+    let ends =
+        |column: &str| -> Result<_> { Ok((value(&format!("{column}_low"))?, value(&format!("{column}_high"))?)) };
+    let (Some(difference), (Some(low), Some(high))) = (value("success_minus_sac")?, ends("success_minus_sac")?) else {
+        return Ok(String::new());
     };
-    let Some(points) = three("success_minus_sac")? else { return Ok(String::new()) };
-    let [points, low, high] = points.map(|share| 100.0 * share);
-    let mut text = format!(
-        " Success from the same test starts, minus that of `{BASELINE}`: {points:+.0} percentage points [{low:+.0}, {high:+.0}]."
-    );
-    if let Some([ratio, low, high]) = three("sac_steps_ratio")? {
-        let bound = if of_baseline("seeds_reaching_80")? < of_baseline("seeds")? { "at least " } else { "" };
-        text += &format!(
-            " To {:.0} % success `{BASELINE}` takes {bound}{ratio:.1} times as many steps [{low:.1}, {high:.1}].",
-            100.0 * LEVEL
-        );
+    let mut text = if low < high {
+        let [difference, low, high] = [difference, low, high].map(|share| 100.0 * share);
+        format!(
+            " Success from the same test starts, minus that of `{BASELINE}`: {difference:+.0} percentage points [{low:+.0}, {high:+.0}]."
+        )
+    } else {
+        format!(" From the same test starts, its episodes and those of `{BASELINE}` show no spread to compare.")
+    };
+    let level = 100.0 * LEVEL;
+    match (value("sac_steps_ratio")?, ends("sac_steps_ratio")?) {
+        (Some(ratio), (Some(low), Some(high))) => {
+            text += &format!(
+                " To {level:.0} % success `{BASELINE}` takes {ratio:.1} times as many steps [{low:.1}, {high:.1}]."
+            );
+        }
+        (Some(ratio), (Some(low), None)) => {
+            text += &format!(
+                " To {level:.0} % success `{BASELINE}` takes at least {ratio:.1} times as many steps (its censored seeds \
+                 count as its budget; 95 % interval from {low:.1})."
+            );
+        }
+        _ => {}
     }
     Ok(text)
 }

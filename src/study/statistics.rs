@@ -145,7 +145,7 @@ pub fn two_level_bootstrap(tasks: &[&[Vec<f64>]], rng: &mut Rng) -> [f64; 2] {
 /// covers the truth more reliably than a bootstrap, but it may leave the range of possible values.
 ///
 /// Student, "The probable error of a mean", Biometrika 6 (1908).
-#[doc(alias = "Student's t")]
+#[doc(alias = "Student t")]
 #[doc(alias = "confidence interval")]
 pub fn t_interval(means: &[f64]) -> Option<[f64; 2]> {
     /// The 97.5 % quantiles for 1 to 9 degrees of freedom.

@@ -159,13 +159,14 @@ impl Runs {
             ("success_minus_sac_high", Some(high)),
         ];
         // With a censored seed of this method, the ratio would be neither an estimate nor a bound; with one of the baseline's,
-        // which counts as its budget, it is a lower bound.
+        // which counts as its budget, it is a lower bound, and its interval has no upper end.
         if let Some(times) = self.times().into_iter().collect::<Option<Vec<f64>>>() {
             let budget = baseline.budget().unwrap_or(f64::NAN);
+            let known = baseline.times().iter().all(Option::is_some);
             let longer: Vec<f64> = baseline.times().into_iter().map(|time| time.unwrap_or(budget)).collect();
             let (ratio, [low, high]) = ratio_of_means(&longer, &times, &mut stream());
             let entries = ["sac_steps_ratio", "sac_steps_ratio_low", "sac_steps_ratio_high"];
-            row.extend(entries.into_iter().zip([ratio, low, high].map(Some)));
+            row.extend(entries.into_iter().zip([Some(ratio), Some(low), known.then_some(high)]));
         }
         row
     }
