@@ -12,12 +12,13 @@ use handful::diff::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, Pendul
 use handful::env::pendulum::Pendulum;
 use handful::prelude::*;
 use handful::rng;
+use handful::study::starts::training_seed;
 
 use nalgebra::SVector;
 use plotters::chart::SeriesLabelPosition;
 
 const SEEDS: u64 = 3;
-const EPISODES: u64 = 20;
+const EPISODES: usize = 20;
 
 #[derive(serde::Deserialize, serde::Serialize)]
 struct Row {
@@ -37,7 +38,7 @@ fn evaluate(mut act: impl FnMut(&[f32]) -> f32) -> Result<f64, Box<dyn Error>> {
     let mut world = Pendulum::default();
     let mut total = 0.0;
     for episode in 0..EPISODES {
-        let mut obs = world.reset((1 << 40) + episode);
+        let mut obs = world.reset(EvalSeeds::Curve.seed(episode)?);
         loop {
             let step = world.step(&[act(&obs)])?;
             total += f64::from(step.reward) / EPISODES as f64;
@@ -71,7 +72,7 @@ fn by_sac(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
     const STEPS: usize = 10_000;
     let mut world = Pendulum::default();
     let mut agent = Sac::new(world.spec(), SacConfig::preset_for("sac", "pendulum")?, seed)?;
-    let mut obs = world.reset(seed << 20);
+    let mut obs = world.reset(training_seed(seed, 0)?);
     let mut spent = Duration::ZERO;
     let mut episodes = 1;
     for steps in 1..=STEPS {
@@ -88,7 +89,7 @@ fn by_sac(seed: u64, rows: &mut Vec<Row>) -> Result<(), Box<dyn Error>> {
             truncated: step.truncated,
         });
         if done {
-            obs = world.reset((seed << 20) + episodes);
+            obs = world.reset(training_seed(seed, episodes)?);
             episodes += 1;
         }
         agent.update();

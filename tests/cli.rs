@@ -42,6 +42,12 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--seeds", "few"], &["'few'", "--seeds", "a number of seeds"]);
     refused(here, &["study", "--jobs", "0"], &["--jobs"]);
     refused(here, &["study", "--tasks", "pendulum", "--methods", "scripted"], &["pendulum has no scripted policy"]);
+    let beyond = ["it must lie in 0..1048576"];
+    check(train(&["--seed", "2097152"]), &["`seed` is 2097152", beyond[0]]);
+    check(train(&["--seed", "18446744073709551615"]), &["`seed` is 18446744073709551615", beyond[0]]);
+    check(train(&["--steps", "9223372036854775808"]), &["`steps` is 9223372036854775808", "it must lie in 0.."]);
+    refused(here, &["study", "--seeds", "1048570..1048580"], &["`seed` is 1048579", beyond[0]]);
+    check(train(&["--starts", "elsewhere"]), &["--starts", "unknown starts `elsewhere`", "development"]);
     refused(here, &["watch", "--task", "reach", "--policy", "scriptd"], &["unknown policy `scriptd`", "`scripted`"]);
     refused(here, &["evaluate", "--run", "nowhere"], &["cannot read", "nowhere"]);
     refused(here, &["report", "--from", "nowhere"], &["cannot read", "nowhere"]);
@@ -97,6 +103,16 @@ fn a_small_study_from_start_to_report() {
     assert_eq!(text(&again.stdout), table);
     assert!(!text(&again.stderr).contains("started"), "{}", text(&again.stderr));
 
+    // Runs that help to choose settings say so, and are not compared with others.
+    let tuning = ["study", "--tasks", "reach", "--methods", "debug", "--seeds", "1", "--starts", "development"];
+    let output = handful(here, &[&tuning[..], &["--out", "tuning"]].concat());
+    assert!(text(&output.stdout).starts_with("Tuning runs"), "{}", text(&output.stderr));
+    let report = std::fs::read_to_string(here.join("tuning/report.md")).expect("a report");
+    assert!(report.contains("development starts"), "{report}");
+    let folders = ["study/reach/debug/seed0", "tuning/reach/debug/seed0"].map(|run| here.join(run));
+    let mixed = handful::study::tables::Tables::gather(folders.iter().map(std::path::PathBuf::as_path));
+    assert!(mixed.expect_err("two kinds of runs").to_string().contains("compare them separately"));
+
     // The report is made from the tables alone.
     std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
     let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);
@@ -119,6 +135,20 @@ fn train_evaluate_and_watch() {
     assert_eq!(summary["episodes"], 3);
     assert!(summary["return_mean"].is_number() && summary["smoothness_sparc"].is_number(), "{summary}");
     refused(here, &["evaluate", "--run", "run", "--episodes", "0"], &["at least one episode"]);
+    refused(
+        here,
+        &["evaluate", "--run", "run", "--seed", "17592186044415"],
+        &["`seed` is 17592186044415", "0..1048576"],
+    );
+    refused(here, &["evaluate", "--run", "run", "--episodes", "1048577"], &["`episode` is 1048576", "0..1048576"]);
+    let both = handful(here, &["evaluate", "--run", "run", "--seed", "1", "--starts", "test"]);
+    assert_eq!(both.status.code(), Some(2), "one or the other: {}", text(&both.stderr));
+    let returns = [["--starts", "test"], ["--starts", "development"], ["--seed", "0"]].map(|starts| {
+        let output = handful(here, &[&["evaluate", "--run", "run", "--episodes", "3", "--json"][..], &starts].concat());
+        let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        summary["return_mean"].as_f64().expect("a number")
+    });
+    assert!(returns[0] != returns[1] && returns[1] != returns[2] && returns[0] != returns[2], "{returns:?}");
 
     let output = handful(here, &["watch", "--run", "run", "--seed", "2"]);
     assert!(output.status.success(), "{}", text(&output.stderr));

@@ -155,7 +155,7 @@ fn acting_alone_is_acting_in_an_evaluation() {
         for start in [EvalSeeds::Test, EvalSeeds::Seed(5)] {
             let mut evaluator = Evaluator::new(|| Ok(Task::Reach.make())).expect("a world");
             let batch = evaluator.evaluate(agent, 1, start).expect("valid actions");
-            let mut obs = env.reset(start.seed(0));
+            let mut obs = env.reset(start.seed(0).expect("a seed in range"));
             agent.begin_episode();
             let mut rewards = Vec::new();
             loop {

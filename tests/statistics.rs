@@ -1,9 +1,23 @@
-//! Smoothness and statistics against numbers computed elsewhere in float64.
+//! Smoothness and statistics against numbers computed elsewhere in float64; the protocol of a comparison.
 
+use std::path::Path;
+
+use handful::agent::dreamer::ActorCriticConfig;
+use handful::agent::{DreamerConfig, PetsConfig};
+use handful::env::cartpole::CartPoleState;
 use handful::env::pendulum::PendulumState;
+use handful::model::{EnsembleConfig, RssmConfig, WorldModelConfig};
+use handful::plan::{IcemConfig, PlannerConfig};
+use handful::prelude::*;
+use handful::rng;
+use handful::study::config::RunConfig;
+use handful::study::run::Event;
 use handful::study::smoothness::{ldlj, of_path, sparc};
-use handful::study::statistics::{area_under_curve, bootstrap, interquartile_mean, steps_to, wilson};
-use handful::{env::cartpole::CartPoleState, rng};
+use handful::study::starts::{LIMIT, Starts, training_seed};
+use handful::study::statistics::{
+    area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference, ratio_of_means,
+    restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
+};
 
 fn near(what: &str, ours: f64, theirs: f64, tolerance: f64) {
     assert!((ours - theirs).abs() <= tolerance, "{what}: {ours}, expected {theirs}");
@@ -85,11 +99,268 @@ fn interquartile_means() {
 
 #[test]
 fn success_curves() {
-    let steps = [0.0, 1000.0, 2000.0, 3000.0, 4000.0, 5000.0];
-    let success = [0.0, 0.1, 0.4, 0.7, 0.85, 0.9];
-    near("area", area_under_curve(&steps, &success), 0.5, 1e-12);
-    near("steps to 80 %", steps_to(0.8, &steps, &success).expect("it gets there"), 3_666.666_666_67, 1e-6);
-    assert_eq!(steps_to(0.95, &steps, &success), None);
+    let steps = [0.0, 10.0, 20.0, 30.0, 40.0, 50.0];
+    let success = [0.0, 0.1, 0.4, 0.7, 0.9, 0.95];
+    near("area", area_under_curve(&steps, &success, 50.0), 0.515, 1e-12);
+    near("area of a part", area_under_curve(&steps, &success, 20.0), 0.15, 1e-12);
+    near("area up to a step between two", area_under_curve(&steps, &success, 25.0), 0.215, 1e-12);
+    assert!(area_under_curve(&steps, &success, 60.0).is_nan(), "the curve does not reach that far");
+    // By the evaluation where it is reached, not by a step between two.
+    assert_eq!(steps_to(0.8, &steps, &success), Some(40.0));
+    assert_eq!(steps_to(0.8, &[0.0, 500.0, 1000.0], &[0.0, 1.0, 1.0]), Some(500.0));
+    assert_eq!(steps_to(0.95, &steps, &success), Some(50.0), "the last evaluation has no next one");
+    assert_eq!(steps_to(0.96, &steps, &success), None);
+    assert_eq!(
+        steps_to(0.8, &steps, &[0.0, 0.9, 0.5, 0.8, 0.8, 0.1]),
+        Some(30.0),
+        "one lucky evaluation is not enough"
+    );
+}
+
+/// Two methods, five seeds each, thousands of steps, budget 150; the last seed of the first does not get there.
+#[test]
+fn censored_times() {
+    let first = [Some(60.0), Some(80.0), Some(100.0), Some(120.0), None];
+    let second = [50.0, 40.0, 90.0, 50.0, 70.0].map(Some);
+    assert_eq!((censored_median(&first), censored_median(&second)), (Some(100.0), Some(50.0)));
+    let means = [restricted_mean(&first, 150.0), restricted_mean(&second, 150.0)];
+    assert_eq!(means, [102.0, 60.0]);
+    assert_eq!(censored_median(&[Some(60.0), None, None]), None, "the median is censored itself");
+    let mut rng = rng::stream(0, "ratio test");
+    let (ratio, [low, high]) =
+        ratio_of_means(&[60.0, 80.0, 100.0, 120.0, 150.0], &[40.0, 50.0, 50.0, 70.0, 90.0], &mut rng);
+    near("ratio", ratio, 1.7, 1e-12);
+    // Exact, over all samples: 1.154 and 2.458. With 10,000 draws, a quantile's share of the distribution has a standard
+    // deviation of 0.0016, which is 0.02 of a ratio at the upper end.
+    near("low", low, 1.154, 0.02);
+    near("high", high, 2.458, 0.05);
+}
+
+/// One agent's test: so many successes in 20 episodes.
+fn agents(successes: [usize; 5]) -> Vec<Vec<f64>> {
+    successes.map(|n| (0..20).map(|i| f64::from(i < n)).collect()).to_vec()
+}
+
+/// Expected ends: exact, by convolution.
+#[test]
+fn the_two_level_bootstrap_of_three_tasks() {
+    let tasks = [[20, 20, 19, 20, 18], [17, 12, 19, 4, 15], [9, 0, 14, 2, 11]].map(agents);
+    let mut rng = rng::stream(0, "two-level test");
+    let [low, high] = two_level_bootstrap(&[&tasks[0], &tasks[1], &tasks[2]], &mut rng);
+    near("low", low, 0.5467, 0.004);
+    near("high", high, 0.7800, 0.004);
+    // Seeds alone: each brings one number.
+    let means = tasks.map(|seeds| seeds.iter().map(|episodes| vec![mean(episodes)]).collect::<Vec<_>>());
+    let [low, high] = two_level_bootstrap(&[&means[0], &means[1], &means[2]], &mut rng);
+    near("low, seeds alone", low, 0.5533, 0.004);
+    near("high, seeds alone", high, 0.7700, 0.004);
+    let [low, high] = wilson(200, 300);
+    near("low, as if episodes were independent", low, 0.6115, 1e-4);
+    near("high, as if episodes were independent", high, 0.7176, 1e-4);
+}
+
+#[test]
+fn t_intervals() {
+    // Mean 0.67, standard deviation 0.293, five seeds.
+    let [low, high] = t_interval(&[0.85, 0.6, 0.95, 0.2, 0.75]).expect("five seeds");
+    near("low", low, 0.67 - 2.776_445 * 0.292_831 / 5.0_f64.sqrt(), 1e-4);
+    near("high", high, 0.67 + 2.776_445 * 0.292_831 / 5.0_f64.sqrt(), 1e-4);
+    assert_eq!(t_interval(&[0.5]), None, "one seed says nothing about others");
+}
+
+#[test]
+fn paired_differences() {
+    let half: Vec<f64> = (0..20).map(|i| f64::from(i % 2)).collect();
+    let (all, none) = (vec![1.0; 20], vec![0.0; 20]);
+    let check = |what: &str, first: Vec<Vec<f64>>, second: Vec<Vec<f64>>, expected: [f64; 3]| {
+        let (middle, [low, high]) = paired_difference(&first, &second, &mut rng::stream(0, "pairs"));
+        [middle, low, high].iter().zip(expected).for_each(|(ours, theirs)| near(what, *ours, theirs, 1e-12));
+    };
+    // Whichever starts are drawn, there is no difference.
+    check("failures from the same starts", vec![half.clone()], vec![half.clone(), half.clone()], [0.0, 0.0, 0.0]);
+    // The second's successes among 20 drawn starts are binomial: 6 to 14.
+    check("one agent each", vec![all.clone()], vec![half], [0.5, 0.3, 0.7]);
+    // 0, 1 or 2 of 2 drawn seeds fail, in 1, 2 and 1 of 4 cases.
+    check("seeds that differ", vec![all.clone()], vec![all.clone(), none.clone()], [0.5, 0.0, 1.0]);
+    check("starts that one of them met", vec![[all, vec![0.0; 30]].concat()], vec![none], [1.0, 1.0, 1.0]);
+}
+
+/// A study by hand: `dreamer` with five seeds, one of which fails, `pets` with two, `sac` with one.
+#[test]
+fn a_summary_says_what_its_seeds_can_tell() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut tests = String::from("task,method,seed,episode,return,success,length,stage,sparc,ldlj\n");
+    let mut evaluations = String::from("task,method,seed,step,episodes,success\n");
+    for (method, successes, every, last) in [
+        ("dreamer", vec![20, 20, 20, 0, 20], 500, 2000),
+        ("pets", vec![20, 20], 500, 1000),
+        ("sac", vec![10], 1000, 2000),
+    ] {
+        for (seed, successes) in successes.into_iter().enumerate() {
+            for i in 0..20 {
+                tests += &format!("pole,{method},{seed},{},-1.5,{},200,0,,\n", i + 1, i < successes);
+            }
+            for step in (0..=last).step_by(every) {
+                let success = if step >= 1000 { successes as f64 / 20.0 } else { 0.0 };
+                evaluations += &format!("pole,{method},{seed},{step},20,{success:?}\n");
+            }
+        }
+    }
+    for (name, text) in [("tests", tests), ("evaluations", evaluations), ("models", "".into()), ("values", "".into())] {
+        std::fs::write(folder.path().join(name).with_extension("csv"), text).expect("a writable folder");
+    }
+    handful::study::report::write(folder.path(), folder.path()).expect("a study");
+    let tables = handful::study::tables::Tables::read(folder.path()).expect("a study");
+    let value = |method: &str, column: &str| tables.value("pole", method, column).expect("a column");
+    // Resampled seeds: none of five fails in a third of the draws, three or more in 6 %.
+    near("low", value("dreamer", "success_low").expect("an end"), 0.4, 1e-12);
+    near("high", value("dreamer", "success_high").expect("an end"), 1.0, 1e-12);
+    assert_eq!(value("dreamer", "success_t_high"), Some(1.0));
+    near("t", value("dreamer", "success_t_low").expect("an end"), 0.8 - 2.776_445 * 0.2, 1e-4);
+    // All episodes agree, or there is one seed only: Wilson's.
+    assert_eq!(value("pets", "success_low"), Some(wilson(40, 40)[0]));
+    assert_eq!(value("sac", "success_low"), Some(wilson(10, 20)[0]));
+    assert_eq!((value("sac", "success_t_low"), value("pets", "success_t_low")), (None, None));
+    // The interquartile mean trims something from four seeds on.
+    assert!(value("dreamer", "success_iqm").is_some());
+    assert_eq!((value("pets", "success_iqm"), value("pets", "success_iqm_low")), (None, None));
+    assert_eq!((value("dreamer", "steps_to_80"), value("sac", "steps_to_80")), (Some(1000.0), None));
+    assert_eq!(value("dreamer", "seeds_reaching_80"), Some(4.0));
+    assert_eq!(value("dreamer", "steps_to_80_restricted_mean"), Some(1200.0));
+    assert_eq!(value("sac", "steps_to_80_restricted_mean"), Some(2000.0));
+    // Areas end where the shortest budget does.
+    assert_eq!(value("dreamer", "common_budget"), Some(1000.0));
+    assert_eq!(value("pets", "area_under_curve"), Some(0.25));
+    assert_eq!(value("pets", "success_minus_sac"), Some(0.5));
+    assert_eq!((value("pets", "sac_steps_ratio"), value("dreamer", "sac_steps_ratio")), (Some(2.0), None));
+    assert_eq!(value("sac", "success_minus_sac"), None);
+    let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
+    for part in [
+        "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
+        "| by 1000 |",
+        "one seed: the interval covers its test episodes, not what another seed would bring",
+        "minus that of `sac`: +50 percentage points [",
+        "takes at least 2.0 times as many steps",
+        "**Not evaluated alike:** `dreamer` every 500 steps with 20 episodes",
+        "`sac` every 1000 steps",
+    ] {
+        assert!(report.contains(part), "no `{part}` in: {report}");
+    }
+}
+
+#[test]
+fn sets_of_starts_share_no_seed() {
+    let (last_seed, last_episode) = (LIMIT - 1, LIMIT as usize - 1);
+    let ends = |from: Result<u64>, to: Result<u64>| [from.expect("in range"), to.expect("in range")];
+    let of = |seeds: EvalSeeds| ends(seeds.seed(0), seeds.seed(last_episode));
+    let users = ends(EvalSeeds::Seed(0).seed(0), EvalSeeds::Seed(last_seed).seed(last_episode));
+    let training = ends(training_seed(0, 0), training_seed(last_seed, last_episode));
+    let mut sets = [training, of(EvalSeeds::Curve), of(EvalSeeds::Test), users, of(EvalSeeds::Development)];
+    sets.sort_unstable();
+    assert!(sets.iter().all(|[first, last]| first < last), "{sets:?}");
+    assert!(sets.windows(2).all(|pair| pair[0][1] < pair[1][0]), "{sets:?}");
+    // Within a set, seeds that follow each other do not overlap either.
+    assert!(training_seed(3, last_episode).expect("in range") < training_seed(4, 0).expect("in range"));
+    // Published numbers depend on these.
+    assert_eq!(training_seed(3, 5).expect("in range"), (3 << 20) + 5);
+    assert_eq!(EvalSeeds::Curve.seed(7).expect("in range"), (1 << 40) + 7);
+    assert_eq!(EvalSeeds::Test.seed(7).expect("in range"), (2 << 40) + 7);
+    assert_eq!(EvalSeeds::Seed(9).seed(7).expect("in range"), (3 << 40) + (9 << 20) + 7);
+    for beyond in [
+        training_seed(LIMIT, 0),
+        training_seed(0, LIMIT as usize),
+        EvalSeeds::Test.seed(LIMIT as usize),
+        EvalSeeds::Seed(17_592_186_044_415).seed(0),
+    ] {
+        let problem = beyond.expect_err("no such seed").to_string();
+        assert!(problem.contains("it must lie in 0..1048576"), "{problem}");
+    }
+}
+
+/// Methods are compared at the same steps, with the same number of episodes, in evaluations and in the test.
+#[test]
+fn presets_of_a_task_agree_on_their_evaluations() {
+    let registry = Registry::standard();
+    for task in registry.env_names() {
+        let configs = ["pets", "dreamer", "planet", "size1m", "sac"]
+            .map(|method| registry.config(task, method, 0, None, None).expect("a preset"));
+        let protocol = |c: &RunConfig| (c.evaluate_every, c.evaluation_episodes, c.test_episodes, c.starts);
+        for config in &configs {
+            assert_eq!(protocol(config), protocol(&configs[0]), "{task}, {}", config.method);
+            assert!(config.steps.is_multiple_of(config.evaluate_every), "{task}, {}: off the grid", config.method);
+            assert_eq!((config.test_episodes, config.starts), (100, Starts::Test));
+        }
+    }
+}
+
+/// Runs that last seconds: SAC, PETS, Dreamer, and planning in Dreamer's world model.
+fn small_runs() -> Vec<RunConfig> {
+    let registry = Registry::standard();
+    let run = |method: &str| registry.config("reach", method, 1, Some(400), None).expect("a preset");
+    let planner = IcemConfig { horizon: 4, population: 10, elites: 4, iterations: 2, ..IcemConfig::default() };
+    let planner = PlannerConfig::Icem(planner);
+    let mut pets: PetsConfig = run("pets").settings().expect("PETS's settings");
+    (pets.warm_up, pets.planner) = (200, planner.clone());
+    pets.ensemble = EnsembleConfig { hidden: vec![16], first_steps: 50, steps: 20, check_every: 10, ..pets.ensemble };
+    let mut dreamer: DreamerConfig = run("dreamer").settings().expect("Dreamer's settings");
+    (dreamer.batch, dreamer.length, dreamer.train_ratio, dreamer.warm_up) = (2, 8, 1.0, 200);
+    dreamer.world = WorldModelConfig { units: 16, layers: 1, ..dreamer.world };
+    dreamer.world.rssm = RssmConfig { deter: 16, blocks: 2, hidden: 8, stoch: 4, classes: 4, ..RssmConfig::default() };
+    dreamer.behaviour = ActorCriticConfig { units: 16, layers: 1, horizon: 5, ..ActorCriticConfig::default() };
+    let planet = DreamerConfig { planner: Some(planner), ..dreamer.clone() };
+    vec![
+        run("debug"),
+        run("pets").with_settings(&pets),
+        run("dreamer").with_settings(&dreamer),
+        run("planet").with_settings(&planet),
+    ]
+}
+
+fn finish(config: &RunConfig, folder: &Path) {
+    let mut run = Registry::standard().open_run(config, folder).expect("a new run");
+    while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
+}
+
+/// Also evaluations in the middle of an episode, which lasts 100 steps here.
+#[test]
+fn evaluations_do_not_disturb_training() {
+    for config in small_runs() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let learned = [70, 400].map(|evaluate_every| {
+            let folder = folder.path().join(evaluate_every.to_string());
+            let few = RunConfig { evaluate_every, evaluation_episodes: 2, test_episodes: 2, ..config.clone() };
+            finish(&few, &folder);
+            std::fs::read(folder.join("weights.safetensors")).expect("weights")
+        });
+        assert!(learned[0] == learned[1], "{}", config.method);
+    }
+}
+
+/// A run that helps to choose settings meets neither the curve's starts nor the test's.
+#[test]
+fn a_tuning_run_is_measured_on_development_starts() {
+    let config = RunConfig { steps: 200, evaluation_episodes: 3, test_episodes: 3, ..small_runs().remove(0) };
+    let folder = tempfile::tempdir().expect("a folder");
+    let measured = [Starts::Test, Starts::Development].map(|starts| {
+        let folder = folder.path().join(starts.name());
+        finish(&RunConfig { starts, ..config.clone() }, &folder);
+        let table = |name: &str| std::fs::read_to_string(folder.join(name)).expect("a table");
+        let returns = table("evaluations.csv").lines().nth(1).and_then(|row| row.split(',').nth(3)?.parse().ok());
+        let (_, mut method) = Registry::standard().trained_method(&folder).expect("a complete run");
+        let mut evaluator = Evaluator::new(|| Registry::standard().make_env(&config)).expect("a world");
+        let again = evaluator.evaluate(&mut method, 3, starts.test()).expect("valid actions").summary();
+        let summary: toml::Table = toml::from_str(&table("summary.toml")).expect("TOML");
+        assert_eq!(summary["return_mean"].as_float(), Some(again.return_mean), "{starts:?}");
+        let before: f64 = returns.expect("a number");
+        before
+    });
+    assert_ne!(measured[0], measured[1], "the same untrained agent, from other starts");
+    // A folder of an earlier version does not say; it was measured as a reported run.
+    let path = folder.path().join("test/config.toml");
+    let text = std::fs::read_to_string(&path).expect("a configuration");
+    assert!(text.contains("starts = \"test\"\n"), "{text}");
+    std::fs::write(&path, text.replace("starts = \"test\"\n", "")).expect("a writable folder");
+    assert_eq!(RunConfig::read(&path).expect("a configuration"), config);
 }
 
 #[test]

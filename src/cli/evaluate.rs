@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use crate::error::Result;
 use crate::study::evaluate::{EvalSeeds, Evaluator};
 use crate::study::registry::Registry;
+use crate::study::starts::Starts;
 
 #[derive(clap::Args)]
 pub(super) struct Args {
@@ -14,9 +15,12 @@ pub(super) struct Args {
     /// Episodes
     #[arg(long, default_value_t = 100)]
     episodes: usize,
-    /// The seed of the initial states; those of the test if left out
-    #[arg(long)]
+    /// The seed of the initial states
+    #[arg(long, conflicts_with = "starts")]
     seed: Option<u64>,
+    /// The initial states: test, or development (on which settings are chosen) [default: those of the run's test]
+    #[arg(long)]
+    starts: Option<Starts>,
     /// Answer in JSON
     #[arg(long)]
     json: bool,
@@ -24,7 +28,7 @@ pub(super) struct Args {
 
 pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let (config, mut method) = registry.trained_method(&args.run)?;
-    let seeds = args.seed.map_or(EvalSeeds::Test, EvalSeeds::Seed);
+    let seeds = args.seed.map_or(args.starts.unwrap_or(config.starts).test(), EvalSeeds::Seed);
     let mut evaluator = Evaluator::new(|| registry.make_env(&config))?;
     let summary = evaluator.evaluate(&mut method, args.episodes, seeds)?.summary();
     if args.json {

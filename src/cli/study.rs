@@ -10,6 +10,7 @@ use crate::error::Result;
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 use crate::study::runner::{self, Profile, StudyPlan};
+use crate::study::starts::Starts;
 
 #[derive(clap::Args)]
 pub(super) struct Args {
@@ -25,6 +26,9 @@ pub(super) struct Args {
     /// How many seeds, or a range like 0..5
     #[arg(long, value_parser = seed_range)]
     seeds: Option<Range<u64>>,
+    /// Where the runs are measured: test, or development for runs that help to choose settings
+    #[arg(long)]
+    starts: Option<Starts>,
     /// Runs at a time; as many as there are cores if left out
     #[arg(long)]
     jobs: Option<NonZeroUsize>,
@@ -35,7 +39,15 @@ pub(super) struct Args {
 
 impl Default for Args {
     fn default() -> Self {
-        Self { profile: ProfileArg::Quick, tasks: None, methods: None, seeds: None, jobs: None, out: None }
+        Self {
+            profile: ProfileArg::Quick,
+            tasks: None,
+            methods: None,
+            seeds: None,
+            starts: None,
+            jobs: None,
+            out: None,
+        }
     }
 }
 
@@ -58,7 +70,8 @@ pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<
     plan.methods = args.methods.unwrap_or(plan.methods);
     plan.seeds = args.seeds.unwrap_or(plan.seeds);
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
-    let runs = plan.runs(registry)?;
+    let mut runs = plan.runs(registry)?;
+    runs.iter_mut().for_each(|(config, _)| config.starts = args.starts.unwrap_or(config.starts));
     let progress = Progress::new(&runs);
     runner::carry_out_all(registry, &runs, jobs, &progress, stop)?;
     progress.finish();

@@ -7,6 +7,7 @@ use super::progress::Progress;
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
+use crate::study::starts::Starts;
 use crate::study::{run, runner};
 
 #[derive(clap::Args)]
@@ -23,6 +24,9 @@ pub(super) struct Args {
     /// The seed of everything random
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Where the run is measured: test, or development for a run that helps to choose settings
+    #[arg(long)]
+    starts: Option<Starts>,
     /// A TOML file with settings that differ from the preset
     #[arg(long)]
     config: Option<PathBuf>,
@@ -32,8 +36,9 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<()> {
-    let Args { task, method, steps, seed, config, out } = args;
-    let config = registry.config(&task, &method, seed, steps, config.as_deref())?;
+    let Args { task, method, steps, seed, starts, config, out } = args;
+    let mut config = registry.config(&task, &method, seed, steps, config.as_deref())?;
+    config.starts = starts.unwrap_or(config.starts);
     let folder = out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{method}-seed{seed}")));
     if run::is_complete(&folder) && RunConfig::read(&folder.join("config.toml"))? == config {
         println!("this run is complete: {}", folder.display());

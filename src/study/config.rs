@@ -5,6 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use toml::{Table, Value};
 
+use super::starts::{LIMIT, Starts, check_below};
 use crate::error::{Error, Result};
 
 /// Everything that a run's outcome depends on. In TOML the agent's settings stand in the table that is named like it.
@@ -15,13 +16,14 @@ pub struct RunConfig {
     pub task: String,
     /// The method's name: that of its preset.
     pub method: String,
-    /// The seed of everything random in the run.
+    /// The seed of everything random in the run, below [`LIMIT`].
     pub seed: u64,
     /// The kind of agent: the name of a registered one.
     pub agent: String,
     /// Environment steps to train for, random warm-up included; 0 for a policy that does not learn.
     pub steps: usize,
-    /// Environment steps between evaluations.
+    /// Environment steps between evaluations. The presets of a task agree on it and on the episodes, because a coarser grid or
+    /// fewer episodes would make their learning curves incomparable.
     #[serde(default = "default_evaluate_every")]
     pub evaluate_every: usize,
     /// Episodes of an evaluation during training.
@@ -30,6 +32,9 @@ pub struct RunConfig {
     /// Episodes of the test at the end.
     #[serde(default = "default_test_episodes")]
     pub test_episodes: usize,
+    /// The initial states of evaluations and test: `test`, or `development` for a run that helps to choose settings.
+    #[serde(default)]
+    pub starts: Starts,
     /// Options of the environment.
     #[serde(default)]
     pub env: Table,
@@ -39,7 +44,7 @@ pub struct RunConfig {
 }
 
 fn default_evaluate_every() -> usize {
-    1000
+    500
 }
 
 fn default_evaluation_episodes() -> usize {
@@ -94,16 +99,19 @@ impl RunConfig {
     }
 
     /// # Errors
-    /// If a number that must be positive is not.
+    /// If a number lies outside its range.
     pub(crate) fn check(&self) -> Result<()> {
-        for (name, value) in [
-            ("evaluate_every", self.evaluate_every),
-            ("evaluation_episodes", self.evaluation_episodes),
-            ("test_episodes", self.test_episodes),
+        check_below("seed", self.seed, LIMIT)?;
+        // An evaluation has no more episodes than there are seeds for.
+        for (name, value, limit) in [
+            ("evaluate_every", self.evaluate_every, u64::MAX),
+            ("evaluation_episodes", self.evaluation_episodes, LIMIT),
+            ("test_episodes", self.test_episodes, LIMIT),
         ] {
             if value == 0 {
                 return Err(Error::Config(format!("`{name}` must be at least 1")));
             }
+            check_below(name, value as u64, limit)?;
         }
         if self.env.get("horizon").and_then(Value::as_integer) == Some(0) {
             return Err(Error::Config("`env.horizon` must be at least 1".into()));

@@ -17,6 +17,7 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 
 use super::smoothness;
+pub use super::starts::EvalSeeds;
 use super::statistics::{deviation, mean, wilson};
 use crate::agent::{Policy, Slot};
 use crate::env::Env;
@@ -26,29 +27,6 @@ use crate::replay::Episode;
 
 /// Environments that are stepped side by side; agents act in all of them in one forward pass.
 const ENVS: usize = 20;
-
-/// Which seeds, and so which initial states, an evaluation has. Training episodes share none of them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum EvalSeeds {
-    /// Those of the evaluations during training.
-    Training,
-    /// Those of the test at the end, which nothing else uses.
-    Test,
-    /// Those derived from a seed of the user's.
-    Seed(u64),
-}
-
-impl EvalSeeds {
-    /// The seed of an episode: what [`Env::reset`] is given.
-    pub fn seed(self, episode: usize) -> u64 {
-        let base = match self {
-            EvalSeeds::Training => 1 << 40,
-            EvalSeeds::Test => 2 << 40,
-            EvalSeeds::Seed(seed) => (3 << 40) + (seed << 20),
-        };
-        base + episode as u64
-    }
-}
 
 /// What came of one episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -88,7 +66,9 @@ pub struct Summary {
     pub episodes: usize,
     /// Success rate.
     pub success: f64,
-    /// Wilson interval of the success rate, 95 %.
+    /// Lower end of the 95 % Wilson interval of this one agent's success rate. Its episodes are independent of each other;
+    /// those of agents trained with several seeds are not, and [`two_level_bootstrap`](super::statistics::two_level_bootstrap)
+    /// is for them.
     pub success_low: f64,
     /// Its upper end.
     pub success_high: f64,
@@ -144,7 +124,8 @@ impl<E: Env> Evaluator<E> {
     /// Lets the policy act in `episodes` episodes with the given seeds.
     ///
     /// # Errors
-    /// If there are no episodes, the environment cannot take the policy's actions, or it breaks its contract.
+    /// If there are no episodes or more than there are seeds, the environment cannot take the policy's actions, or it breaks
+    /// its contract.
     pub fn evaluate<P: Policy + ?Sized>(
         &mut self,
         policy: &mut P,
@@ -171,8 +152,10 @@ impl<E: Env> Evaluator<E> {
         if episodes == 0 {
             return Err(Error::Config("an evaluation needs at least one episode".into()));
         }
+        // Before the first episode, not after a million of them.
+        seeds.seed(episodes - 1)?;
         let done = evaluation.results.len();
-        let seeds: Vec<u64> = (done..episodes.min(done + ENVS)).map(|i| seeds.seed(i)).collect();
+        let seeds = (done..episodes.min(done + ENVS)).map(|i| seeds.seed(i)).collect::<Result<Vec<u64>>>()?;
         if !seeds.is_empty() {
             self.side_by_side(evaluation, policy, &seeds)?;
         }

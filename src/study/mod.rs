@@ -48,6 +48,9 @@ pub mod report;
 pub mod run;
 pub mod runner;
 pub mod smoothness;
+pub mod starts;
 pub mod statistics;
+#[cfg(feature = "study")]
+mod summary;
 #[cfg(feature = "study")]
 pub mod tables;

@@ -3,8 +3,9 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use super::tables::{LEVEL, Tables};
-use super::{figures, tables};
+use super::figures;
+use super::starts::Starts;
+use super::tables::{BASELINE, Curve, LEVEL, Tables};
 use crate::error::Result;
 use crate::files;
 
@@ -20,6 +21,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     let mut tasks: Vec<&str> = pairs.iter().map(|(task, _)| task.as_str()).collect();
     tasks.dedup();
     let mut text = String::from("# Comparison\n\n");
+    text += tuning_note(&tables)?;
     text += "Every number on this page comes from `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` in the same folder. ";
     text += "All methods are evaluated in the same way: the same tasks, observations and initial states, deterministic actions, ";
     text += "and every environment step counted, including the random warm-up. ";
@@ -28,10 +30,12 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(
-        "\nSuccess: share of test episodes in which the task is solved at the last step, with its 95 % Wilson interval. Steps to \
-         {:.0} %: environment steps at which the success curve, interpolated linearly between evaluations, first reaches \
-         that level; median over seeds (a dash if the median seed does not reach it). SPARC, LDLJ: smoothness of the \
-         hand's movement; closer to zero is smoother.\n",
+        "\nSuccess: share of test episodes in which the task is solved at the last step, with a 95 % interval. With several \
+         seeds, that is the two-level bootstrap: seeds are drawn, then the episodes of each. With one seed (a method that does \
+         not learn needs only one), and where all episodes have the same outcome, it is the Wilson interval, which covers the \
+         test episodes and not the differences between seeds. Steps to {:.0} %: the first evaluation at which that success \
+         rate is reached and held at the next; median over seeds (a dash if the median seed does not reach it within its \
+         budget). SPARC, LDLJ: smoothness of the hand's movement; closer to zero is smoother.\n",
         100.0 * LEVEL
     );
     for task in &tasks {
@@ -64,7 +68,18 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += "\n## How certain is this?\n\n";
     text += &caveat(&tables, &pairs)?;
     files::write(&to.join("report.md"), text.as_bytes())?;
-    Ok(text_table(&rows(&tables)?))
+    Ok(tuning_note(&tables)?.to_string() + &text_table(&rows(&tables)?))
+}
+
+/// What stands above the numbers of runs that served to choose settings.
+fn tuning_note(tables: &Tables) -> Result<&'static str> {
+    Ok(match tables.starts()? {
+        Starts::Test => "",
+        Starts::Development => {
+            "Tuning runs: everything here was measured on development starts. Choose settings by it, but report the results \
+             of runs on the test's starts.\n\n"
+        }
+    })
 }
 
 const HEAD: [&str; 9] = ["task", "method", "seeds", "steps", "success", "return", "steps to 80 %", "SPARC", "LDLJ"];
@@ -86,7 +101,7 @@ fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
             show("steps", 0)?,
             success,
             show("return_mean", 1)?,
-            show("steps_to_80", 0)?,
+            value("steps_to_80")?.map_or("-".into(), |steps| format!("by {steps:.0}")),
             show("smoothness_sparc", 2)?,
             show("smoothness_ldlj", 2)?,
         ]);
@@ -115,25 +130,101 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
     let mut text = String::new();
     for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
         let value = |column: &str| tables.value(task, &method, column);
-        let success = 100.0 * value("success")?.unwrap_or(0.0);
-        match (value("steps")?, value("steps_to_80")?, value("seeds_reaching_80")?, value("seeds")?) {
-            (Some(budget), Some(steps), Some(reaching), Some(seeds)) => writeln!(
-                text,
-                "- `{method}` reaches {:.0} % success after {steps:.0} steps (median; {reaching:.0} of {seeds:.0} seeds reach \
-                 it within {budget:.0}) and ends at {success:.0} %.",
-                100.0 * tables::LEVEL
+        let (success, level) = (100.0 * value("success")?.unwrap_or(0.0), 100.0 * LEVEL);
+        let (Some(budget), Some(reaching), Some(seeds)) =
+            (value("steps")?, value("seeds_reaching_80")?, value("seeds")?)
+        else {
+            text += &format!("- `{method}` does not learn; it succeeds in {success:.0} % of the test episodes.\n");
+            continue;
+        };
+        text += &match value("steps_to_80")? {
+            Some(steps) => format!(
+                "- `{method}` reaches {level:.0} % success by step {steps:.0} (median; {reaching:.0} of {seeds:.0} seeds \
+                 reach it within {budget:.0}) and ends at {success:.0} %"
             ),
-            (Some(budget), None, Some(reaching), Some(seeds)) => writeln!(
-                text,
-                "- `{method}` does not reach {:.0} % success in its median seed within {budget:.0} steps ({reaching:.0} of \
-                 {seeds:.0} seeds do); it ends at {success:.0} %.",
-                100.0 * tables::LEVEL
+            None => format!(
+                "- `{method}` does not reach {level:.0} % success in its median seed within {budget:.0} steps \
+                 ({reaching:.0} of {seeds:.0} seeds do); it ends at {success:.0} %"
             ),
-            _ => writeln!(text, "- `{method}` does not learn; it succeeds in {success:.0} % of the test episodes."),
+        };
+        text += &match (value("success_t_low")?, value("success_t_high")?) {
+            (Some(low), Some(high)) => {
+                format!(" (t interval over its {seeds:.0} seeds: [{:.0}, {:.0}]).", 100.0 * low, 100.0 * high)
+            }
+            _ if seeds < 2.0 => {
+                " (one seed: the interval covers its test episodes, not what another seed would bring).".into()
+            }
+            _ => ".".into(),
+        };
+        text += &against_the_baseline(tables, task, &method)?;
+        text.push('\n');
+    }
+    Ok(text + &different_grids(tables, task)?)
+}
+
+/// The comparison of a method with [`BASELINE`], if both learn the task.
+fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<String> {
+    let value = |column: &str| tables.value(task, method, column);
+    let ends =
+        |column: &str| -> Result<_> { Ok((value(&format!("{column}_low"))?, value(&format!("{column}_high"))?)) };
+    let (Some(difference), (Some(low), Some(high))) = (value("success_minus_sac")?, ends("success_minus_sac")?) else {
+        return Ok(String::new());
+    };
+    let mut text = if low < high {
+        let [difference, low, high] = [difference, low, high].map(|share| 100.0 * share);
+        format!(
+            " Success from the same test starts, minus that of `{BASELINE}`: {difference:+.0} percentage points [{low:+.0}, {high:+.0}]."
+        )
+    } else {
+        format!(" From the same test starts, its episodes and those of `{BASELINE}` show no spread to compare.")
+    };
+    let level = 100.0 * LEVEL;
+    match (value("sac_steps_ratio")?, ends("sac_steps_ratio")?) {
+        (Some(ratio), (Some(low), Some(high))) => {
+            text += &format!(
+                " To {level:.0} % success `{BASELINE}` takes {ratio:.1} times as many steps [{low:.1}, {high:.1}]."
+            );
         }
-        .expect("text grows");
+        (Some(ratio), (Some(low), None)) => {
+            text += &format!(
+                " To {level:.0} % success `{BASELINE}` takes at least {ratio:.1} times as many steps (its censored seeds \
+                 count as its budget; 95 % interval from {low:.1})."
+            );
+        }
+        _ => {}
     }
     Ok(text)
+}
+
+/// A warning if the methods that learn a task were not all evaluated at the same steps with the same number of episodes.
+fn different_grids(tables: &Tables, task: &str) -> Result<String> {
+    let mut grids: Vec<(String, Vec<Curve>)> = Vec::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        grids.push((method.clone(), tables.evaluation_grid(task, &method)?));
+    }
+    grids.retain(|(_, seeds)| !seeds.is_empty());
+    let mut seeds = grids.iter().flat_map(|(_, seeds)| seeds);
+    let Some(common) = seeds.clone().filter_map(|(steps, _)| steps.last().copied()).reduce(f64::min) else {
+        return Ok(String::new());
+    };
+    // Budgets may differ: what counts is the part that all have in common.
+    let until = |(steps, episodes): &Curve| -> Vec<(f64, f64)> {
+        steps.iter().copied().zip(episodes.iter().copied()).take_while(|(step, _)| *step <= common).collect()
+    };
+    let first = seeds.next().map(until);
+    if seeds.all(|seed| Some(until(seed)) == first) {
+        return Ok(String::new());
+    }
+    let one = |(method, seeds): &(String, Vec<Curve>)| {
+        let (steps, episodes) = &seeds[0];
+        let every = steps.get(1).unwrap_or(&0.0) - steps[0];
+        format!("`{method}` every {every:.0} steps with {:.0} episodes", episodes[0])
+    };
+    Ok(format!(
+        "\n**Not evaluated alike:** {}. A coarser grid reports a later step, and with fewer episodes it is more a matter of \
+         luck.\n",
+        grids.iter().map(one).collect::<Vec<_>>().join(", ")
+    ))
 }
 
 fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
@@ -146,13 +237,13 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
     Ok(match fewest {
         f64::INFINITY => "No method here learns, so the only uncertainty is that of the test episodes.\n".into(),
         n if n < 5.0 => format!(
-            "Not very: with {n:.0} seed{} of a learning method, the intervals describe these particular agents, not the \
-             method. Run `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
+            "Not very: a learning method has only {n:.0} seed{} here, too few for an interval over seeds to be trusted. Run \
+             `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
             if n == 1.0 { "" } else { "s" }
         ),
         n => format!(
-            "Each learning method has at least {n:.0} seeds. `summary.csv` contains the interquartile mean over seeds with its \
-             bootstrap interval (`success_iqm_low`, `success_iqm_high`); trust only differences larger than this interval.\n"
+            "Each learning method has at least {n:.0} seeds. With five, a bootstrap interval that should cover the truth in 95 % \
+             of cases covers it in about 90; the t interval over seeds is the safer one.\n"
         ),
     })
 }

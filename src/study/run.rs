@@ -24,8 +24,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::config::RunConfig;
-use super::evaluate::{EvalSeeds, Evaluation, Evaluator};
+use super::evaluate::{Evaluation, Evaluator};
 use super::records::{self, EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
+use super::starts::training_seed;
 use crate::agent::{Method, Mode};
 use crate::checkpoint::Weights;
 use crate::env::Env;
@@ -192,9 +193,7 @@ impl<E: Env> Run<E> {
     }
 
     fn start_episode(&mut self) -> Result<()> {
-        // Seeds of different runs lie 2^20 episodes apart.
-        let seed = (self.config.seed << 20) + self.progress.episodes.len() as u64;
-        self.obs = self.env.reset(seed)?;
+        self.obs = self.env.reset(training_seed(self.config.seed, self.progress.episodes.len())?)?;
         if let Some(agent) = self.method.as_learner() {
             agent.begin_episode();
         }
@@ -208,7 +207,7 @@ impl<E: Env> Run<E> {
 
     fn evaluate(&mut self) -> Result<Event> {
         let (step, episodes) = (self.progress.step, self.config.evaluation_episodes);
-        let evaluation = self.evaluator.evaluate(&mut self.method, episodes, EvalSeeds::Training)?;
+        let evaluation = self.evaluator.evaluate(&mut self.method, episodes, self.config.starts.curve())?;
         let row = EvaluationRow::new(step, evaluation.summary());
         if let Some(agent) = self.method.as_learner() {
             let open_loop = agent.open_loop(&evaluation.episodes).into_iter();
@@ -222,7 +221,7 @@ impl<E: Env> Run<E> {
 
     fn test(&mut self) -> Result<Event> {
         let (test, episodes) = (&mut self.progress.test, self.config.test_episodes);
-        let complete = self.evaluator.next_batch(test, &mut self.method, episodes, EvalSeeds::Test)?;
+        let complete = self.evaluator.next_batch(test, &mut self.method, episodes, self.config.starts.test())?;
         self.save()?;
         let test = &self.progress.test;
         if !complete {

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use super::config::RunConfig;
 use super::registry::Registry;
 use super::run::{self, Event};
+use super::starts::{LIMIT, check_below};
 use crate::error::{Error, Result};
 
 /// How much a study takes on.
@@ -52,7 +53,7 @@ impl StudyPlan {
     /// The runs, each with its folder. A method that does not learn runs once.
     ///
     /// # Errors
-    /// If there is nothing to run, or a method or task is unknown.
+    /// If there is nothing to run, a seed is not below [`LIMIT`], or a method or task is unknown.
     pub fn runs(&self, registry: &Registry) -> Result<Vec<(RunConfig, PathBuf)>> {
         if self.seeds.is_empty() {
             return Err(Error::Config(format!(
@@ -60,6 +61,7 @@ impl StudyPlan {
                 self.seeds.start, self.seeds.end
             )));
         }
+        check_below("seed", self.seeds.end - 1, LIMIT)?;
         if self.tasks.is_empty() || self.methods.is_empty() {
             return Err(Error::Config("a study needs at least one task and one method".into()));
         }

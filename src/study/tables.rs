@@ -7,13 +7,16 @@ use std::path::Path;
 use polars::prelude::*;
 
 use super::config::RunConfig;
-use super::statistics::{area_under_curve, bootstrap, interquartile_mean, mean, steps_to, wilson};
+use super::starts::Starts;
+use super::summary::summarise;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::rng;
 
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
+
+/// The method that the other methods which learn are compared with.
+pub const BASELINE: &str = "sac";
 
 /// The curve of one seed: environment steps, and the value at each of them.
 pub type Curve = (Vec<f64>, Vec<f64>);
@@ -29,7 +32,7 @@ pub struct Tables {
     /// task, method, seed, step, expected, realised, ...: the estimated value in each
     /// evaluation, and the discounted return that followed.
     pub values: DataFrame,
-    /// task, method, seed, episode, return, success, ...: one row per test episode.
+    /// task, method, seed, episode, return, success, ..., starts: one row per test episode.
     pub tests: DataFrame,
     /// One row per task and method, computed from the other tables.
     pub summary: DataFrame,
@@ -39,7 +42,8 @@ impl Tables {
     /// Collects the tables from the folders of runs.
     ///
     /// # Errors
-    /// If a run's files are missing or damaged.
+    /// If a run's files are missing or damaged, or some runs were tested on the test's starts and others on development
+    /// starts.
     pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
         let (mut evaluations, mut tests) = (Vec::new(), Vec::new());
         let (mut models, mut values) = (Vec::new(), Vec::new());
@@ -54,7 +58,7 @@ impl Tables {
                     all().as_expr(),
                 ]))
             };
-            tests.push(labelled("test.csv")?);
+            tests.push(labelled("test.csv")?.with_column(lit(config.starts.name()).alias("starts")));
             if config.learns() {
                 evaluations.push(labelled("evaluations.csv")?);
             }
@@ -68,30 +72,47 @@ impl Tables {
             let options = UnionArgs { to_supertypes: true, ..UnionArgs::default() };
             if frames.is_empty() { Ok(DataFrame::empty()) } else { concat(frames, options)?.collect() }
         };
-        let joined = || -> PolarsResult<Self> {
-            Self::summarised(join(evaluations)?, join(models)?, join(values)?, join(tests)?)
-        };
-        joined().map_err(inside)
+        let joined =
+            || -> PolarsResult<[DataFrame; 4]> { Ok([join(evaluations)?, join(models)?, join(values)?, join(tests)?]) };
+        Self::summarised(joined().map_err(inside)?)
     }
 
     /// Reads the tables of a study from its folder.
     ///
     /// # Errors
-    /// If one is missing or damaged.
+    /// If one is missing or damaged, or the starts of the tests differ.
     pub fn read(folder: &Path) -> Result<Self> {
         let [evaluations, models, values, tests] =
             ["evaluations.csv", "models.csv", "values.csv", "tests.csv"].map(|name| read(&folder.join(name)));
-        Self::summarised(evaluations?, models?, values?, tests?).map_err(inside)
+        Self::summarised([evaluations?, models?, values?, tests?])
     }
 
-    fn summarised(
-        evaluations: DataFrame,
-        models: DataFrame,
-        values: DataFrame,
-        tests: DataFrame,
-    ) -> PolarsResult<Self> {
-        let summary = summarise(&evaluations, &tests)?;
-        Ok(Self { evaluations, models, values, tests, summary })
+    fn summarised([evaluations, models, values, tests]: [DataFrame; 4]) -> Result<Self> {
+        let summary = summarise(&evaluations, &tests).map_err(inside)?;
+        let tables = Self { evaluations, models, values, tests, summary };
+        tables.starts()?;
+        Ok(tables)
+    }
+
+    /// On which starts the runs were tested. Tables of earlier versions do not say: they know only the test's.
+    ///
+    /// # Errors
+    /// If some were tested on the test's and others on development starts: these numbers do not belong in one table.
+    pub fn starts(&self) -> Result<Starts> {
+        if self.tests.column("starts").is_err() {
+            return Ok(Starts::Test);
+        }
+        let mut names = strings(&self.tests, "starts").map_err(inside)?;
+        names.sort();
+        names.dedup();
+        match names.as_slice() {
+            [] => Ok(Starts::Test),
+            [name] => name.parse(),
+            _ => Err(Error::Config(format!(
+                "some runs were tested on the starts `{}`, others on `{}`; compare them separately",
+                names[0], names[1]
+            ))),
+        }
     }
 
     /// Writes the collected tables into a study's folder.
@@ -125,6 +146,14 @@ impl Tables {
     /// If the table lacks a column.
     pub fn curves(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
         curves(&self.evaluations, task, method, "success").map_err(inside)
+    }
+
+    /// The evaluations of a method during training: for each seed, their steps, and the episodes of each.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn evaluation_grid(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
+        curves(&self.evaluations, task, method, "episodes").map_err(inside)
     }
 
     /// A column of `models.csv` over environment steps, for one horizon: for each seed, steps and values. Empty for methods
@@ -165,82 +194,7 @@ impl Tables {
     }
 }
 
-fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFrame> {
-    let tests = by_run(tests.clone().lazy(), &["success", "return", "length", "sparc", "ldlj"])?;
-    let pairs = tests.clone().lazy().select([col("task"), col("method")]);
-    let pairs = pairs.unique_stable(None, UniqueKeepStrategy::First).collect()?;
-    let (tasks, methods) = (strings(&pairs, "task")?, strings(&pairs, "method")?);
-    let mut columns: Vec<(&str, Vec<Option<f64>>)> = SUMMARY.map(|name| (name, Vec::new())).into();
-    for (task, method) in tasks.iter().zip(&methods) {
-        let runs = of(&tests, task, method)?;
-        let success = lists(&runs, "success")?;
-        let by_seed: Vec<f64> = success.iter().map(|episodes| mean(episodes)).collect();
-        let successes = success.concat();
-        let mean_of = |column: &str| -> PolarsResult<Option<f64>> {
-            let known = lists(&runs, column)?.concat();
-            Ok((!known.is_empty()).then(|| mean(&known)))
-        };
-        let [low, high] = wilson(successes.iter().filter(|s| **s > 0.5).count(), successes.len());
-        let bound = bootstrap(&by_seed, interquartile_mean, &mut rng::stream(0, "bootstrap"));
-        let curves = curves(evaluations, task, method, "success")?;
-        let reached: Vec<f64> = curves.iter().filter_map(|(x, y)| steps_to(LEVEL, x, y)).collect();
-        let areas: Vec<f64> = curves.iter().map(|(x, y)| area_under_curve(x, y)).collect();
-        let budget = curves.iter().filter_map(|(x, _)| x.last().copied()).reduce(f64::max);
-        // The median over all seeds; a seed that never reaches the level counts as infinitely many steps.
-        let median = (!curves.is_empty()).then(|| median_with_missing(&reached, curves.len())).flatten();
-        let values = [
-            Some(by_seed.len() as f64),
-            budget,
-            Some(successes.len() as f64),
-            Some(mean(&successes)),
-            Some(low),
-            Some(high),
-            Some(interquartile_mean(&by_seed)),
-            Some(bound[0]),
-            Some(bound[1]),
-            mean_of("return")?,
-            mean_of("length")?,
-            median,
-            (!curves.is_empty()).then_some(reached.len() as f64),
-            (!areas.is_empty()).then(|| mean(&areas)),
-            mean_of("sparc")?,
-            mean_of("ldlj")?,
-        ];
-        columns.iter_mut().zip(values).for_each(|((_, column), value)| column.push(value));
-    }
-    let mut all = vec![Column::new("task".into(), tasks), Column::new("method".into(), methods)];
-    all.extend(columns.into_iter().map(|(name, values)| Column::new(name.into(), values)));
-    DataFrame::new_infer_height(all)
-}
-
-const SUMMARY: [&str; 16] = [
-    "seeds",
-    "steps",
-    "test_episodes",
-    "success",
-    "success_low",
-    "success_high",
-    "success_iqm",
-    "success_iqm_low",
-    "success_iqm_high",
-    "return_mean",
-    "length_mean",
-    "steps_to_80",
-    "seeds_reaching_80",
-    "area_under_curve",
-    "smoothness_sparc",
-    "smoothness_ldlj",
-];
-
-/// The median of `n` values of which only the smallest are known; `None` if the median is not among these.
-fn median_with_missing(known: &[f64], n: usize) -> Option<f64> {
-    let mut sorted = known.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let (low, high) = (sorted.get((n - 1) / 2)?, sorted.get(n / 2)?);
-    Some((low + high) / 2.0)
-}
-
-fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
+pub(super) fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
     if frame.width() == 0 {
         return Ok(frame.clone());
     }
@@ -249,13 +203,13 @@ fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
 }
 
 /// Groups rows by run: one row per run, in the order of the runs, with each of these columns as a list.
-fn by_run(rows: LazyFrame, columns: &[&str]) -> PolarsResult<DataFrame> {
+pub(super) fn by_run(rows: LazyFrame, columns: &[&str]) -> PolarsResult<DataFrame> {
     let lists: Vec<Expr> = columns.iter().map(|name| col(*name).strict_cast(DataType::Float64).drop_nulls()).collect();
     rows.group_by_stable(["task", "method", "seed"].map(col)).agg(lists).collect()
 }
 
 /// A column over environment steps, for each seed.
-fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
+pub(super) fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
     if rows.width() == 0 {
         return Ok(Vec::new());
     }
@@ -264,12 +218,12 @@ fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResu
     Ok(lists(&runs, "step")?.into_iter().zip(lists(&runs, value)?).collect())
 }
 
-fn lists(runs: &DataFrame, column: &str) -> PolarsResult<Vec<Vec<f64>>> {
+pub(super) fn lists(runs: &DataFrame, column: &str) -> PolarsResult<Vec<Vec<f64>>> {
     let numbers = |list: Series| Ok(list.f64()?.iter().flatten().collect());
     runs.column(column)?.list()?.no_null_series_iter().map(numbers).collect()
 }
 
-fn strings(frame: &DataFrame, column: &str) -> PolarsResult<Vec<String>> {
+pub(super) fn strings(frame: &DataFrame, column: &str) -> PolarsResult<Vec<String>> {
     Ok(frame.column(column)?.str()?.iter().map(|s| s.unwrap_or_default().to_string()).collect())
 }
 

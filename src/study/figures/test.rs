@@ -12,8 +12,8 @@ use crate::files;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Drawn = std::result::Result<(), Box<dyn std::error::Error>>;
 
-/// The final test of every method on one task: success rate with its 95 % Wilson interval, and
-/// smoothness of the hand if there is one.
+/// The final test of every method on one task: success rate with its 95 % interval from the summary, and smoothness of the
+/// hand if there is one.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -64,7 +64,7 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
             }
             Ok(())
         };
-        let success = |area: &Area| panel(area, "success rate, 95 % Wilson interval", 110, 0.0, 1.03, true);
+        let success = |area: &Area| panel(area, "success rate, 95 % interval", 110, 0.0, 1.03, true);
         let Some(roughest) = roughest else {
             return success(&area);
         };

@@ -31,6 +31,7 @@ pub use envs::{EnvEntry, NoOptions, Settings};
 
 use super::config::{RunConfig, bad_config, upgrade_keys};
 use super::run::Run;
+use super::starts::{LIMIT, check_below};
 use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, merge, preset_table, specialise};
 use crate::checkpoint::Weights;
 use crate::env::Env;
@@ -126,7 +127,8 @@ impl Registry {
     /// by `steps` if it is given. All defaults are filled in.
     ///
     /// # Errors
-    /// If task or method are unknown, the file cannot be read, or a field or value in it is wrong.
+    /// If task or method are unknown, `seed` or `steps` is too large, the file cannot be read, or a field or value in it is
+    /// wrong.
     pub fn config(
         &self,
         task: &str,
@@ -147,9 +149,12 @@ impl Registry {
         }
         table.insert("task".into(), Value::String(task.into()));
         table.insert("method".into(), Value::String(method.into()));
-        table.insert("seed".into(), Value::Integer(seed as i64));
-        if let Some(steps) = steps {
-            table.insert("steps".into(), Value::Integer(steps as i64));
+        // TOML's integers are signed: what does not fit would come out negative.
+        for (field, value) in [("seed", Some(seed)), ("steps", steps.map(|steps| steps as u64))] {
+            if let Some(value) = value {
+                check_below(field, value, if field == "seed" { LIMIT } else { i64::MAX as u64 })?;
+                table.insert(field.into(), Value::Integer(value as i64));
+            }
         }
         let path = file.unwrap_or(Path::new(method));
         let mut config = RunConfig::from_table(table).map_err(|problem| bad_config(path, &problem))?;

@@ -1,0 +1,185 @@
+//! The summary of a study: one row per task and method, computed from the evaluations and tests of its runs.
+
+use polars::prelude::*;
+
+use super::statistics::{
+    IQM_RUNS, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
+    ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
+};
+use super::tables::{BASELINE, Curve, LEVEL, by_run, curves, lists, of, strings};
+use crate::rng::{self, Rng};
+
+/// The runs of one method on one task.
+struct Runs {
+    task: String,
+    method: String,
+    /// For each seed, whether each test episode succeeded, in the order of the starts.
+    success: Vec<Vec<f64>>,
+    /// For each seed, the success curve; empty if the method does not learn.
+    curves: Vec<Curve>,
+    /// Columns of the test whose mean is taken over all episodes.
+    means: Vec<(&'static str, Option<f64>)>,
+}
+
+/// One row per task and method, in the order in which they were run.
+pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFrame> {
+    let tests = by_run(tests.clone().lazy(), &["success", "return", "length", "sparc", "ldlj"])?;
+    let pairs = tests.clone().lazy().select([col("task"), col("method")]);
+    let pairs = pairs.unique_stable(None, UniqueKeepStrategy::First).collect()?;
+    let mut all = Vec::new();
+    for (task, method) in strings(&pairs, "task")?.into_iter().zip(strings(&pairs, "method")?) {
+        let rows = of(&tests, &task, &method)?;
+        let mut means = Vec::new();
+        for (column, name) in [
+            ("return", "return_mean"),
+            ("length", "length_mean"),
+            ("sparc", "smoothness_sparc"),
+            ("ldlj", "smoothness_ldlj"),
+        ] {
+            let known = lists(&rows, column)?.concat();
+            means.push((name, (!known.is_empty()).then(|| mean(&known))));
+        }
+        let (success, curves) = (lists(&rows, "success")?, curves(evaluations, &task, &method, "success")?);
+        all.push(Runs { task, method, success, curves, means });
+    }
+    let names = |of: fn(&Runs) -> &String| all.iter().map(|runs| of(runs).clone()).collect::<Vec<String>>();
+    let mut columns =
+        vec![Column::new("task".into(), names(|r| &r.task)), Column::new("method".into(), names(|r| &r.method))];
+    let rows: Vec<Vec<(&str, Option<f64>)>> = all.iter().map(|runs| runs.row(&all)).collect();
+    for name in SUMMARY {
+        let entry = |row: &Vec<(&str, Option<f64>)>| row.iter().find(|(known, _)| *known == name).and_then(|(_, v)| *v);
+        columns.push(Column::new(name.into(), rows.iter().map(entry).collect::<Vec<Option<f64>>>()));
+    }
+    DataFrame::new_infer_height(columns)
+}
+
+/// The columns after task and method. Scripts read them by name: new ones are added at the end, none is removed.
+const SUMMARY: [&str; 26] = [
+    "seeds",
+    "steps",
+    "test_episodes",
+    "success",
+    "success_low",
+    "success_high",
+    "success_iqm",
+    "success_iqm_low",
+    "success_iqm_high",
+    "return_mean",
+    "length_mean",
+    "steps_to_80",
+    "seeds_reaching_80",
+    "area_under_curve",
+    "smoothness_sparc",
+    "smoothness_ldlj",
+    "success_t_low",
+    "success_t_high",
+    "steps_to_80_restricted_mean",
+    "common_budget",
+    "success_minus_sac",
+    "success_minus_sac_low",
+    "success_minus_sac_high",
+    "sac_steps_ratio",
+    "sac_steps_ratio_low",
+    "sac_steps_ratio_high",
+];
+
+/// The stream of every bootstrap: the tables alone decide its result.
+fn stream() -> Rng {
+    rng::stream(0, "bootstrap")
+}
+
+impl Runs {
+    fn learns(&self) -> bool {
+        !self.curves.is_empty()
+    }
+
+    /// The steps of the last evaluation, the largest over the seeds.
+    fn budget(&self) -> Option<f64> {
+        self.curves.iter().filter_map(|(x, _)| x.last().copied()).reduce(f64::max)
+    }
+
+    /// By which step each seed reaches the level.
+    fn times(&self) -> Vec<Option<f64>> {
+        self.curves.iter().map(|(x, y)| steps_to(LEVEL, x, y)).collect()
+    }
+
+    fn row(&self, all: &[Self]) -> Vec<(&'static str, Option<f64>)> {
+        let by_seed: Vec<f64> = self.success.iter().map(|episodes| mean(episodes)).collect();
+        let episodes = self.success.concat();
+        let [low, high] = success_interval(&self.success);
+        let mut row = self.means.clone();
+        row.extend([
+            ("seeds", Some(by_seed.len() as f64)),
+            ("steps", self.budget()),
+            ("test_episodes", Some(episodes.len() as f64)),
+            ("success", Some(mean(&episodes))),
+            ("success_low", Some(low)),
+            ("success_high", Some(high)),
+        ]);
+        if by_seed.len() >= IQM_RUNS {
+            let [low, high] = bootstrap(&by_seed, interquartile_mean, &mut stream());
+            row.extend([
+                ("success_iqm", Some(interquartile_mean(&by_seed))),
+                ("success_iqm_low", Some(low)),
+                ("success_iqm_high", Some(high)),
+            ]);
+        }
+        // Seeds that all agree show no spread to make an interval of.
+        if let Some(ends) = t_interval(&by_seed).filter(|[low, high]| low < high) {
+            let [low, high] = ends.map(|end| Some(end.clamp(0.0, 1.0)));
+            row.extend([("success_t_low", low), ("success_t_high", high)]);
+        }
+        if let Some(budget) = self.budget() {
+            let times = self.times();
+            let learners = all.iter().filter(|other| other.task == self.task && other.learns());
+            let lasts = learners.flat_map(|other| &other.curves).filter_map(|(x, _)| x.last().copied());
+            let common = lasts.reduce(f64::min).unwrap_or(budget);
+            let areas: Vec<f64> = self.curves.iter().map(|(x, y)| area_under_curve(x, y, common)).collect();
+            row.extend([
+                ("steps_to_80", censored_median(&times)),
+                ("seeds_reaching_80", Some(times.iter().flatten().count() as f64)),
+                ("steps_to_80_restricted_mean", Some(restricted_mean(&times, budget))),
+                ("area_under_curve", Some(mean(&areas))),
+                ("common_budget", Some(common)),
+            ]);
+            let is_baseline = |other: &&Self| other.task == self.task && other.method == BASELINE && other.learns();
+            if let Some(baseline) = all.iter().find(is_baseline).filter(|_| self.method != BASELINE) {
+                row.extend(self.against(baseline));
+            }
+        }
+        row
+    }
+
+    /// The comparison with the baseline's runs on the same task.
+    fn against(&self, baseline: &Self) -> Vec<(&'static str, Option<f64>)> {
+        let (difference, [low, high]) = paired_difference(&self.success, &baseline.success, &mut stream());
+        let mut row = vec![
+            ("success_minus_sac", Some(difference)),
+            ("success_minus_sac_low", Some(low)),
+            ("success_minus_sac_high", Some(high)),
+        ];
+        // With a censored seed of this method, the ratio would be neither an estimate nor a bound; with one of the baseline's,
+        // which counts as its budget, it is a lower bound, and its interval has no upper end.
+        if let Some(times) = self.times().into_iter().collect::<Option<Vec<f64>>>() {
+            let budget = baseline.budget().unwrap_or(f64::NAN);
+            let known = baseline.times().iter().all(Option::is_some);
+            let longer: Vec<f64> = baseline.times().into_iter().map(|time| time.unwrap_or(budget)).collect();
+            let (ratio, [low, high]) = ratio_of_means(&longer, &times, &mut stream());
+            let entries = ["sac_steps_ratio", "sac_steps_ratio_low", "sac_steps_ratio_high"];
+            row.extend(entries.into_iter().zip([Some(ratio), Some(low), known.then_some(high)]));
+        }
+        row
+    }
+}
+
+/// The 95 % interval of a success rate. One seed: Wilson's, of this agent. Several: the two-level bootstrap; but if all
+/// episodes of all seeds have the same outcome, resampling them shows no spread at all, and Wilson's is given, which knows
+/// nothing of differences between seeds but at least of the number of episodes.
+fn success_interval(seeds: &[Vec<f64>]) -> [f64; 2] {
+    let episodes = seeds.concat();
+    let successes = episodes.iter().filter(|success| **success > 0.5).count();
+    if seeds.len() == 1 || successes == 0 || successes == episodes.len() {
+        return wilson(successes, episodes.len());
+    }
+    two_level_bootstrap(&[seeds], &mut stream())
+}
