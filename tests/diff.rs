@@ -6,7 +6,7 @@ use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_for
 use handful::diff::pusher::STATE;
 use handful::diff::{
     AnalyticPolicyGradient, AnalyticPolicyGradientConfig, CartPoleSwing, Ilqr, IlqrConfig, IlqrControl, PendulumSwing,
-    Pusher, PusherTask, RecordedPush, System,
+    Pusher, PusherTask, RecordedPush, Solution, System,
 };
 use handful::env::cartpole::CartPoleState;
 use handful::env::pendulum::{Pendulum, PendulumState};
@@ -107,24 +107,37 @@ fn the_classics_are_those_of_the_environments() {
     }
 }
 
+/// A single guess ends upright in two of five cases for the pendulum (nearly always for the cart-pole), the rest in local
+/// minima; so the best of many counts.
 #[test]
 fn ilqr_swings_up_pendulum_and_cart_pole() {
     let mut rng = rng::stream(3, "diff");
-    let mut guess = |count: usize| -> Vec<SVector<f64, 1>> {
-        (0..count).map(|_| SVector::from([0.1 * rng::normal(&mut rng)])).collect()
-    };
     let ilqr = Ilqr::new(IlqrConfig { iterations: 300, ..IlqrConfig::default() });
-    let found = ilqr.solve(&PendulumSwing, &SVector::from([PI, 0.0]), &guess(100));
+
+    let found = best_of_guesses(&ilqr, &PendulumSwing, &SVector::from([PI, 0.0]), 100, &mut rng);
     let end = found.states[100];
     println!("pendulum: {} iterations, {} steps, cost {:.2}, end {end:?}", found.iterations, found.steps, found.cost);
     assert!(end[0].cos() > 0.99 && end[1].abs() < 0.3, "{end}");
     assert!(found.actions.iter().all(|action| action[0].abs() <= 1.0));
 
-    let found = ilqr.solve(&CartPoleSwing, &SVector::from([0.0, 0.0, PI, 0.0]), &guess(150));
+    let found = best_of_guesses(&ilqr, &CartPoleSwing, &SVector::from([0.0, 0.0, PI, 0.0]), 150, &mut rng);
     let end = found.states[150];
     println!("cart-pole: {} iterations, {} steps, cost {:.2}, end {end:?}", found.iterations, found.steps, found.cost);
     assert!(end[2].cos() > 0.99 && end[3].abs() < 0.5, "{end}");
     assert!(found.actions.iter().all(|action| action[0].abs() <= 1.0));
+}
+
+/// The cheapest solution from 32 small random guesses.
+fn best_of_guesses<const N: usize>(
+    ilqr: &Ilqr,
+    system: &impl System<N, 1>,
+    start: &SVector<f64, N>,
+    steps: usize,
+    rng: &mut Rng,
+) -> Solution<N, 1> {
+    let mut guess = || (0..steps).map(|_| SVector::from([0.1 * rng::normal(rng)])).collect::<Vec<_>>();
+    let solutions = (0..32).map(|_| ilqr.solve(system, start, &guess()));
+    solutions.min_by(|a, b| a.cost.total_cmp(&b.cost)).expect("some guesses")
 }
 
 /// From wherever the hand is, to goals all around.
