@@ -2,7 +2,7 @@
 
 use handful::env::{Env, Feature, KnownReward, Spec, Task};
 use handful::model::calibration::{GaussianForecast, coverage};
-use handful::model::open_loop::{OpenLoop, open_loop};
+use handful::model::open_loop::{OpenLoop, Propagated, open_loop};
 use handful::model::{
     Autoencoder, AutoencoderConfig, Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward,
     RssmConfig, WorldModel, WorldModelConfig,
@@ -177,7 +177,12 @@ fn a_model_is_judged_over_many_steps() {
     let (_, unseen) = experience(2000, &mut rng);
     let mut ensemble = Ensemble::new(&spec(), config(), &mut rng).expect("usable settings");
     ensemble.fit(&data, &mut rng);
-    let measured = open_loop(&ensemble.dynamics(), &unseen, &mut rng);
+    let measured = open_loop(
+        &Propagated { dynamics: &ensemble.dynamics(), propagation: Propagation::TsInf },
+        &spec(),
+        &unseen,
+        &mut rng,
+    );
     let horizons: Vec<usize> = measured.iter().map(|row| row.horizon).collect();
     assert_eq!(horizons, [1, 2, 5, 10, 15, 25]);
     for row in measured {
@@ -221,7 +226,7 @@ fn latent_models_foresee_too() {
     for _ in 0..600 {
         autoencoder.learn(&data.sample(16, 8, &mut rng), &mut optimiser);
     }
-    better("autoencoder", open_loop(&autoencoder, &unseen, &mut rng));
+    better("autoencoder", open_loop(&autoencoder, &spec(), &unseen, &mut rng));
 
     let rssm = RssmConfig { deter: 32, blocks: 2, hidden: 32, stoch: 8, classes: 8, unimix: 0.01 };
     let config =
@@ -231,7 +236,7 @@ fn latent_models_foresee_too() {
     for _ in 0..800 {
         world.learn(&data.sample(16, 16, &mut rng), &mut optimiser, &mut rng);
     }
-    better("world model", open_loop(&world, &unseen, &mut rng));
+    better("world model", open_loop(&world, &spec(), &unseen, &mut rng));
 
     // The rewards that it predicts after observing each step.
     let episode = &unseen[0];
