@@ -11,8 +11,8 @@ use std::path::Path;
 use handful::agent::{DreamerConfig, Preset};
 use handful::chart::Chart;
 use handful::env::{Env, Spec, Task, World};
-use handful::model::open_loop::{OpenLoopModel, open_loop};
-use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, WorldModel};
+use handful::model::open_loop::{OpenLoopModel, Propagated, open_loop};
+use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, Propagation, WorldModel};
 use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
 use handful::replay::{Episode, ReplayBuffer, SequenceReplay, Transition};
@@ -90,26 +90,8 @@ struct Row {
     coverage90: f64,
 }
 
-/// A model compared only on what all models predict in the same form: latent models predict the orientation of a cube in
-/// canonical form.
-struct WithoutOrientation<'a, Model> {
-    model: &'a Model,
-    spec: &'a Spec,
-}
-
-impl<Model: OpenLoopModel> OpenLoopModel for WithoutOrientation<'_, Model> {
-    fn predicted_features(&self) -> Vec<(usize, f32)> {
-        let features = self.model.predicted_features().into_iter();
-        features.filter(|(i, _)| self.spec.observation[*i].cube.is_none()).collect()
-    }
-
-    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
-        self.model.open_loop_predictions(starts, horizon, rng)
-    }
-}
-
 fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
-    for row in open_loop(&WithoutOrientation { model, spec }, episodes, &mut rng::stream(0, "judge")) {
+    for row in open_loop(model, spec, episodes, &mut rng::stream(0, "judge")) {
         let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
         println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
         rows.push(Row { model: name.into(), horizon, rmse, rmse_p90, coverage90 });
@@ -128,7 +110,8 @@ fn compare(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let config = EnsembleConfig { hidden: vec![200, 200], first_steps: STEPS, ..EnsembleConfig::default() };
     let mut ensemble = Ensemble::new(spec, config, &mut rng)?;
     ensemble.fit(&training.transitions, &mut rng);
-    evaluate("ensemble", &ensemble.dynamics(), spec, &held_out, &mut rows);
+    let dynamics = &ensemble.dynamics();
+    evaluate("ensemble", &Propagated { dynamics, propagation: Propagation::TsInf }, spec, &held_out, &mut rows);
 
     let mut autoencoder = Autoencoder::new(spec, &AutoencoderConfig::default(), &mut rng);
     let mut optimiser = Adam::new(AdamConfig { max_norm: Some(10.0), ..AdamConfig::new(1e-3) });

@@ -53,6 +53,8 @@ pub struct Feature {
     /// The cube whose orientation it belongs to, if any. Six consecutive features give a cube's orientation: the directions
     /// of its x-axis and of its z-axis. A cube looks the same from every side, and models may make use of that symmetry.
     pub cube: Option<String>,
+    /// Whether it is a flag, 0 or 1. Models predict a flip in full, however rare it is.
+    pub flag: bool,
 }
 
 /// How a feature changes over an episode.
@@ -76,7 +78,7 @@ pub enum Role {
 impl Feature {
     /// A dynamic feature with centre 0 and scale 1.
     pub fn new(name: impl Into<String>) -> Self {
-        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::Dynamic, cube: None }
+        Self { name: name.into(), centre: 0.0, scale: 1.0, role: Role::Dynamic, cube: None, flag: false }
     }
 
     /// The same feature, constant throughout an episode.
@@ -87,6 +89,11 @@ impl Feature {
     /// The same feature as the difference `minuend - subtrahend` of two other features, given by name.
     pub fn difference(self, minuend: impl Into<String>, subtrahend: impl Into<String>) -> Self {
         Self { role: Role::Difference { minuend: minuend.into(), subtrahend: subtrahend.into() }, ..self }
+    }
+
+    /// The same feature as a flag, 0 or 1: whether something touches, for example.
+    pub fn flag(self) -> Self {
+        Self { flag: true, ..self.around(0.5, 0.5) }
     }
 
     /// The same feature as one of the six that give a cube's orientation.

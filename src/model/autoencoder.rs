@@ -105,10 +105,6 @@ impl Autoencoder {
 }
 
 impl OpenLoopModel for Autoencoder {
-    fn predicted_features(&self) -> Vec<(usize, f32)> {
-        self.obs_features.evaluated()
-    }
-
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, _rng: &mut Rng) -> Vec<Vec<f32>> {
         let obs: Vec<f32> = starts.iter().flat_map(|(episode, t)| episode.observations[*t].iter().copied()).collect();
         let actions: Vec<Vec<f32>> = starts.iter().map(|start| actions_from(*start, ahead).collect()).collect();

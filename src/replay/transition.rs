@@ -64,8 +64,8 @@ pub struct ReplayBuffer {
     observation_size: usize,
     action_size: usize,
     capacity: usize,
-    /// Where the next transition goes.
-    next: usize,
+    /// Transitions added so far, those that were overwritten included.
+    pushed: u64,
     /// One row for each transition: obs, action, reward, next_obs, terminated.
     rows: Vec<f32>,
 }
@@ -73,11 +73,16 @@ pub struct ReplayBuffer {
 impl ReplayBuffer {
     /// A buffer for `capacity` transitions.
     pub fn new(observation_size: usize, action_size: usize, capacity: usize) -> Self {
-        Self { observation_size, action_size, capacity: capacity.max(1), next: 0, rows: Vec::new() }
+        Self { observation_size, action_size, capacity: capacity.max(1), pushed: 0, rows: Vec::new() }
     }
 
     fn width(&self) -> usize {
         2 * self.observation_size + self.action_size + 2
+    }
+
+    /// Where the next transition goes.
+    fn next(&self) -> usize {
+        (self.pushed % self.capacity as u64) as usize
     }
 
     /// Transitions held.
@@ -102,11 +107,10 @@ impl ReplayBuffer {
         if self.len() < self.capacity {
             self.rows.extend(row);
         } else {
-            let width = self.width();
-            let old = &mut self.rows[self.next * width..][..width];
-            old.iter_mut().zip(row).for_each(|(old, new)| *old = *new);
+            let from = self.next() * self.width();
+            self.rows[from..].iter_mut().zip(row).for_each(|(old, new)| *old = *new);
         }
-        self.next = (self.next + 1) % self.capacity;
+        self.pushed += 1;
     }
 
     /// The transition at index `i`. Once the buffer is full, indices are not in the order of time.
@@ -119,6 +123,15 @@ impl ReplayBuffer {
         let (action, rest) = rest.split_at(self.action_size);
         let (reward, next_obs, terminated) = (rest[0], &rest[1..=self.observation_size], rest[rest.len() - 1] > 0.5);
         Row { obs, action, reward, next_obs, terminated }
+    }
+
+    /// How many transitions had been added before the one at index `i`. Unlike `i` it is in the order of time, and no other
+    /// transition ever has the same one.
+    pub fn serial(&self, i: usize) -> u64 {
+        let (full, next) = (self.pushed / self.capacity as u64, self.next());
+        // Indices from `next` on still hold transitions of the lap before.
+        let laps = if i < next { full } else { full.saturating_sub(1) };
+        laps * self.capacity as u64 + i as u64
     }
 
     /// Samples `size` transitions uniformly, with replacement.
@@ -142,7 +155,8 @@ impl ReplayBuffer {
     /// Writes the buffer into `weights`, under `prefix`.
     pub fn save(&self, weights: &mut Weights, prefix: &str) {
         weights.insert(format!("{prefix}.rows"), self.rows.clone(), [1, self.len(), self.width()]);
-        weights.insert_counts(format!("{prefix}.next"), &[self.next as u64]);
+        weights.insert_counts(format!("{prefix}.next"), &[self.next() as u64]);
+        weights.insert_counts(format!("{prefix}.pushed"), &[self.pushed]);
     }
 
     /// Reads what [`ReplayBuffer::save`] wrote.
@@ -159,8 +173,52 @@ impl ReplayBuffer {
             )));
         }
         let rows = weights.get(&name, [1, count, self.width()])?.to_vec();
-        self.next = weights.counts(&format!("{prefix}.next"), 1)?[0] as usize;
+        let next = weights.counts(&format!("{prefix}.next"), 1)?[0];
+        self.pushed = if count < self.capacity {
+            count as u64
+        } else {
+            // Older checkpoints do not say how often the ring was filled; any number tells its order.
+            weights.counts(&format!("{prefix}.pushed"), 1).map_or(count as u64 + next, |pushed| pushed[0])
+        };
         self.rows = rows;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbered(i: u64) -> Transition {
+        let (obs, next_obs) = (vec![i as f32], vec![i as f32 + 1.0]);
+        Transition { obs, action: vec![0.0], reward: 0.0, next_obs, terminated: false, truncated: false }
+    }
+
+    /// Each transition keeps its serial number while it is in the ring, and in a checkpoint; an old checkpoint, which does
+    /// not have them, at least loads with all numbers in the order of time.
+    #[test]
+    fn serial_numbers_are_for_life() {
+        let mut buffer = ReplayBuffer::new(1, 1, 7);
+        for i in 0..40 {
+            buffer.push(&numbered(i));
+            let mut state = Weights::default();
+            buffer.save(&mut state, "replay");
+            let mut resumed = ReplayBuffer::new(1, 1, 7);
+            resumed.load(&state, "replay").expect("what was saved");
+            for row in 0..buffer.len() {
+                assert_eq!(buffer.serial(row), buffer.row(row).obs[0] as u64);
+                assert_eq!(resumed.serial(row), buffer.serial(row));
+            }
+            let mut old = Weights::default();
+            old.insert("replay.rows", buffer.rows.clone(), [1, buffer.len(), buffer.width()]);
+            old.insert_counts("replay.next", &[buffer.next() as u64]);
+            resumed.load(&old, "replay").expect("an old checkpoint");
+            assert_eq!(resumed.next(), buffer.next());
+            for row in 0..buffer.len() {
+                assert_eq!(resumed.serial(row) - resumed.serial(buffer.next() % buffer.len()), {
+                    buffer.serial(row) - buffer.serial(buffer.next() % buffer.len())
+                });
+            }
+        }
     }
 }

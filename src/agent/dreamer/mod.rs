@@ -5,7 +5,7 @@
 //! [`Dreamer`] wires the parts: the world model is in [`crate::model`], actor and critic are in [`ActorCritic`], planners in
 //! [`crate::plan`], one update in `update.rs`. Losses, networks and constants are those of the published code. Deviations:
 //! replayed sequences start with a latent state of zeros, new experience has no precedence in the replay buffer, positions
-//! are seen as differences (`model/view.rs`), and in evaluation the policy acts by its mean.
+//! are seen as differences (`model/features/latent.rs`), and in evaluation the policy acts by its mean.
 //!
 //! ```
 //! use handful::agent::dreamer::DreamerConfig;
@@ -55,7 +55,7 @@ const SHOWN: usize = 12;
 #[doc(alias = "PlaNet")]
 pub struct Dreamer {
     config: DreamerConfig,
-    action_size: usize,
+    spec: Spec,
     networks: Networks,
     optimiser: Adam,
     scale: ReturnScale,
@@ -96,7 +96,7 @@ impl Dreamer {
         let (behaviour, target) = ActorCritic::new(&world, spec.action_size, &config.behaviour, &mut rng);
         let optimiser = AdamConfig { warm_up: config.learning_warm_up, ..AdamConfig::laprop(config.learning_rate) };
         let mut agent = Self {
-            action_size: spec.action_size,
+            spec: spec.clone(),
             policy_state: PolicyState::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
             networks: Networks { world, behaviour, target },
             optimiser: Adam::new(optimiser),
@@ -134,20 +134,20 @@ impl Agent for Dreamer {
     }
 
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
-        let Self { config, networks, action_size, observed, random, noise, policy_state, slots, rng, .. } = self;
+        let Self { config, networks, spec, observed, random, noise, policy_state, slots, rng, .. } = self;
         match mode {
             Mode::Explore if *observed < config.warm_up => random.next(rng),
             Mode::Explore => policy_state.act(networks, obs, Some(&noise.deviates(rng))),
             Mode::Evaluate => {
-                let fresh = |i| PolicyState::of_slot(&networks.world, config, *action_size, i);
+                let fresh = |i| PolicyState::of_slot(&networks.world, config, spec.action_size, i);
                 slots.state(0, fresh).act(networks, obs, None)
             }
         }
     }
 
     fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        let Self { slots: states, config, networks, action_size, .. } = self;
-        let fresh = |i| PolicyState::of_slot(&networks.world, config, *action_size, i);
+        let Self { slots: states, config, networks, spec, .. } = self;
+        let fresh = |i| PolicyState::of_slot(&networks.world, config, spec.action_size, i);
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
         let each = states.states(slots, fresh).into_par_iter().zip(observations);
         each.map(|(state, obs)| state.act(networks, obs, None)).collect()
@@ -156,7 +156,7 @@ impl Agent for Dreamer {
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
         let action = self.act_batch(&[*slot]).remove(0);
         let Networks { world, behaviour, .. } = &self.networks;
-        let fresh = |i| PolicyState::of_slot(world, &self.config, self.action_size, i);
+        let fresh = |i| PolicyState::of_slot(world, &self.config, self.spec.action_size, i);
         let start = self.slots.state(slot.index, fresh).latent.repeated(0, SHOWN);
         let rollout = behaviour.imagine(world, &start, &mut rng::stream(0, "dreamer foresight"));
         let decoded: Vec<Vec<f32>> = rollout.features.iter().map(|features| world.decode(features)).collect();
@@ -195,15 +195,15 @@ impl Agent for Dreamer {
 
 impl Diagnostics for Dreamer {
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
-        open_loop(&self.networks.world, episodes, &mut rng::stream(0, "open loop"))
+        open_loop(&self.networks.world, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 
     fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
-        let Self { networks: Networks { world, behaviour, .. }, config, action_size, .. } = self;
+        let Self { networks: Networks { world, behaviour, .. }, config, spec, .. } = self;
         let discount = config.world.discount();
         let of_episode = |(i, episode): (usize, &Episode)| {
             let mut policy_state =
-                PolicyState::new(world, config, *action_size, rng::stream(i as u64, "dreamer values"));
+                PolicyState::new(world, config, spec.action_size, rng::stream(i as u64, "dreamer values"));
             let values = episode.observations.iter().enumerate().map(|(t, obs)| {
                 policy_state.observe(world, obs);
                 if let Some(action) = episode.actions.get(t) {
@@ -254,7 +254,7 @@ impl Checkpoint for Dreamer {
         self.update_credit = update_credit;
         self.rng = rng::from_state(&own);
         self.policy_state =
-            PolicyState::new(&self.networks.world, &self.config, self.action_size, rng::from_state(&policy_state));
+            PolicyState::new(&self.networks.world, &self.config, self.spec.action_size, rng::from_state(&policy_state));
         self.random.reset();
         self.noise.reset();
         Ok(())

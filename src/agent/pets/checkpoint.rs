@@ -4,14 +4,15 @@ use super::Pets;
 use crate::agent::{Checkpoint, Diagnostics};
 use crate::checkpoint::Weights;
 use crate::error::Result;
-use crate::model::open_loop::{OpenLoop, open_loop};
+use crate::model::open_loop::{OpenLoop, Propagated, open_loop};
 use crate::replay::Episode;
 use crate::rng;
 
 impl Diagnostics for Pets {
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
-        let measure = |dynamics| open_loop(dynamics, episodes, &mut rng::stream(0, "open loop"));
-        self.dynamics.as_ref().map(measure).unwrap_or_default()
+        let Some(dynamics) = &self.dynamics else { return Vec::new() };
+        let model = Propagated { dynamics, propagation: self.config.propagation };
+        open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 }
 

@@ -86,7 +86,7 @@ pub fn gripper_features() -> Vec<Feature> {
     ["finger opening", "finger target"]
         .map(|name| Feature::new(name).around(0.02, 0.02))
         .into_iter()
-        .chain(["pad contact left", "pad contact right"].map(|name| Feature::new(name).around(0.5, 0.5)))
+        .chain(["pad contact left", "pad contact right"].map(|name| Feature::new(name).flag()))
         .collect()
 }
 

@@ -29,8 +29,9 @@ pub struct EnsembleConfig {
     /// it, in its own order.
     #[doc(alias = "bagging")]
     pub bootstrap: bool,
-    /// Fraction of the transitions held out as validation set (at most 2000): for early stopping, the choice of elites and
-    /// the temperature of the predicted standard deviations.
+    /// Fraction of the transitions held out as validation set: for early stopping, the choice of elites and the temperature
+    /// of the predicted standard deviations. Which transitions these are is settled when they enter the replay buffer, so
+    /// that no fit ever trains on them.
     #[doc(alias = "validation ratio")]
     pub held_out: f64,
     /// Gradient steps of the first fit, at most.
@@ -39,7 +40,9 @@ pub struct EnsembleConfig {
     pub steps: usize,
     /// Gradient steps between two evaluations on the validation set.
     pub check_every: usize,
-    /// Early stopping: a fit ends after this many evaluations in a row in which no member has improved.
+    /// Early stopping: a fit ends after this many evaluations in a row in which no member has improved by 1 %. It has an
+    /// effect on later fits only if it is well below `steps / check_every`. Whether it does or not, each member ends with
+    /// the weights of its best evaluation.
     #[doc(alias = "early stopping")]
     pub patience: usize,
     /// Whether the bounds of the log-variance are learned (as in PETS) or constant (as in mbrl-lib's default).
@@ -49,7 +52,8 @@ pub struct EnsembleConfig {
     #[doc(alias = "beta-NLL")]
     pub beta: f32,
     /// Targets are clipped to this many standard deviations, so that rare large changes (a cube that tips over) do not
-    /// dominate the loss.
+    /// dominate the loss. The change of a [flag](crate::env::Feature::flag) is never clipped: its unit is at least
+    /// `1 / max_target`.
     pub max_target: f32,
     /// Whether the reward is learned too; otherwise a known reward function is needed for planning.
     pub learn_reward: bool,
@@ -74,7 +78,7 @@ impl Default for EnsembleConfig {
             first_steps: 2000,
             steps: 500,
             check_every: 50,
-            patience: 10,
+            patience: 5,
             learn_bounds: false,
             beta: 0.5,
             max_target: 10.0,

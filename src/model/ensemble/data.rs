@@ -60,8 +60,17 @@ impl Ensemble {
         let floor = |i: &usize| MIN_STD * self.scales[*i];
         let unscaled = vec![MIN_STD; self.features.near.len() + self.actions];
         let input_floors: Vec<f32> = self.features.raw.iter().map(floor).chain(unscaled).collect();
-        let target_floors: Vec<f32> =
-            self.features.predicted.iter().map(floor).chain(self.config.learn_reward.then_some(MIN_STD)).collect();
+        // A flag that flips in a share f of all steps changes by 1/sqrt(f) standard deviations: clipped, the flip of a rare
+        // one would be predicted too small to be noticed. With this floor no flip exceeds the clip.
+        let flip = 1.0 / self.config.max_target;
+        let target_floor = |i: &usize| if self.flags[*i] { floor(i).max(flip) } else { floor(i) };
+        let target_floors: Vec<f32> = self
+            .features
+            .predicted
+            .iter()
+            .map(target_floor)
+            .chain(self.config.learn_reward.then_some(MIN_STD))
+            .collect();
         self.inputs = Normaliser::fit(&inputs, &input_floors);
         self.targets = Normaliser::fit(&targets, &target_floors);
         if self.config.gated {

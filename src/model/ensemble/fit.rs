@@ -3,7 +3,6 @@
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
-use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 use super::data::{Data, Schedule};
@@ -15,9 +14,7 @@ use crate::nn::{
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 
-/// Size of the validation set, at most.
-const MAX_HELD_OUT: usize = 2000;
-/// A member has improved when its validation error has fallen by this fraction.
+/// A fall of a member's validation error by this fraction resets the patience.
 const IMPROVEMENT: f64 = 0.01;
 /// Fitted temperatures lie between its inverse and this.
 const MAX_TEMPERATURE: f32 = 5.0;
@@ -33,6 +30,16 @@ pub struct Fit {
     /// Validation error of each member: mean squared error of its mean, in normalised units (predicting the mean change
     /// has error 1). Empty without validation set.
     pub errors: Vec<f64>,
+}
+
+/// Whether the transition of this serial number belongs to the validation set: for a share `held_out` of all, once and for
+/// all, so that no fit ever trains on it. Serial numbers count because of the golden ratio (a low-discrepancy sequence):
+/// the share holds in every stretch of experience, and no rhythm of episodes or repeated actions is met. The first
+/// transition is always one for training.
+fn is_held_out(serial: u64, held_out: f64) -> bool {
+    const GOLDEN_RATIO: u64 = 0x9e37_79b9_7f4a_7c15;
+    let phase = (serial.wrapping_mul(GOLDEN_RATIO) >> 11) as f64 / (1_u64 << 53) as f64;
+    phase >= 1.0 - held_out
 }
 
 /// One network of the ensemble with its optimiser. Members share nothing but the data, so they train in parallel.
@@ -51,16 +58,33 @@ pub(super) struct Learner {
 
 parameters_of_fields!(Learner: network, bounds);
 
-/// The best weights of a member during a fit.
+/// The best weights of a member during a fit. Whether a snapshot is better and whether it is worth going on for are
+/// separate questions: many gains below [`IMPROVEMENT`] add up.
 struct Best {
     error: f64,
     /// None without validation set.
     learner: Option<Learner>,
+    /// The error at the last improvement that reset the patience.
+    milestone: f64,
 }
 
 impl Default for Best {
     fn default() -> Self {
-        Self { error: f64::INFINITY, learner: None }
+        Self { error: f64::INFINITY, learner: None, milestone: f64::INFINITY }
+    }
+}
+
+impl Best {
+    /// Keeps the learner if its validation error is the lowest so far. Returns whether it resets the patience.
+    fn consider(&mut self, error: f64, learner: &Learner) -> bool {
+        if error < self.error {
+            (self.error, self.learner) = (error, Some(learner.clone()));
+        }
+        let improved = error < self.milestone * (1.0 - IMPROVEMENT);
+        if improved {
+            self.milestone = error;
+        }
+        improved
     }
 }
 
@@ -76,15 +100,12 @@ impl Ensemble {
     #[doc(alias = "train")]
     pub fn fit(&mut self, replay: &ReplayBuffer, rng: &mut Rng) -> Fit {
         let data = self.normalised(replay);
-        let mut order: Vec<usize> = (0..data.rows).collect();
-        order.shuffle(rng);
-        let held_out = ((self.config.held_out * data.rows as f64) as usize).min(MAX_HELD_OUT);
-        let (validation, training) = order.split_at(held_out);
+        let (validation, training): (Vec<usize>, Vec<usize>) =
+            (0..data.rows).partition(|row| is_held_out(replay.serial(*row), self.config.held_out));
         let mut schedules: Vec<Schedule> =
-            (0..self.config.members).map(|_| Schedule::new(training, self.config.bootstrap, rng)).collect();
+            (0..self.config.members).map(|_| Schedule::new(&training, self.config.bootstrap, rng)).collect();
 
         let limit = if self.is_fitted() { self.config.steps } else { self.config.first_steps };
-        // The initial weights are no candidates: they may have been trained on what is now the validation set.
         let mut best: Vec<Best> = (0..self.config.members).map(|_| Best::default()).collect();
         let (mut steps, mut loss, mut checks_without_improvement) = (0, 0.0, 0);
         while steps < limit && checks_without_improvement < self.config.patience {
@@ -96,11 +117,8 @@ impl Ensemble {
                 continue;
             }
             let mut improved = false;
-            for ((best, error), member) in best.iter_mut().zip(self.errors(&data, validation)).zip(&self.members) {
-                if error < best.error * (1.0 - IMPROVEMENT) {
-                    *best = Best { error, learner: Some(member.learner.clone()) };
-                    improved = true;
-                }
+            for ((best, error), member) in best.iter_mut().zip(self.errors(&data, &validation)).zip(&self.members) {
+                improved |= best.consider(error, &member.learner);
             }
             checks_without_improvement = if improved { 0 } else { checks_without_improvement + 1 };
         }
@@ -113,7 +131,7 @@ impl Ensemble {
         self.elites.sort_by(|a, b| best[*a].error.total_cmp(&best[*b].error));
         self.elites.truncate(self.config.elites);
         let errors = best.iter().map(|best| best.error).filter(|error| error.is_finite()).collect();
-        self.fit_temperature(&data, validation);
+        self.fit_temperature(&data, &validation);
         self.fits += 1;
         Fit { steps, loss: (loss / (steps.max(1) * self.config.members) as f64) as f32, errors }
     }
@@ -218,5 +236,24 @@ impl Learner {
     /// Upper and lower bounds of the log-variances.
     fn bounds(&self) -> [&[f32]; 2] {
         [values(&self.bounds.max), values(&self.bounds.min)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_held_out_share_is_met_in_every_stretch_and_every_rhythm() {
+        for share in [0.05, 0.1, 0.5] {
+            assert!(!is_held_out(0, share), "something is left to train on");
+            for rhythm in [1, 3, 10, 150, 200] {
+                for start in (0..1_000_000).step_by(77_777) {
+                    let count = (0..400).filter(|i| is_held_out(start + rhythm * i, share)).count();
+                    assert!((count as f64 - 400.0 * share).abs() < 20.0, "{share}, {rhythm}, {start}: {count}");
+                }
+            }
+        }
+        assert!((0..100_000).all(|serial| !is_held_out(serial, 0.0)));
     }
 }

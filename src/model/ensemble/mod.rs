@@ -10,7 +10,9 @@
 //!   step, the hand by centimetres).
 //! - The bounds of the log-variance are constant unless [`EnsembleConfig::learn_bounds`] is set (as in mbrl-lib), and each
 //!   member has its own.
-//! - Early stopping keeps the best weights of each member separately; weight decay is decoupled (AdamW).
+//! - Early stopping keeps the best weights of each member separately, whatever the margin (mbrl-lib asks for 1 % of any
+//!   member); weight decay is decoupled (AdamW).
+//! - A share of the transitions is held out from all fits, as validation set (PETS holds none out).
 //! - Predicted standard deviations are calibrated by a temperature on the validation set.
 //!
 //! ```
@@ -63,6 +65,8 @@ pub struct Ensemble {
     features: FeatureMap,
     /// Scale of each feature of an observation, from the spec.
     scales: Vec<f32>,
+    /// Whether each feature of an observation is a flag.
+    flags: Vec<bool>,
     actions: usize,
     members: Vec<Member>,
     inputs: Normaliser,
@@ -104,6 +108,7 @@ impl Ensemble {
         Ok(Self {
             features,
             scales: spec.observation.iter().map(|feature| feature.scale).collect(),
+            flags: spec.observation.iter().map(|feature| feature.flag).collect(),
             actions,
             members: (0..config.members).map(member).collect(),
             inputs: Normaliser::identity(inputs),

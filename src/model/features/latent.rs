@@ -21,8 +21,6 @@ use crate::nn::{Tensor3, tensor, values};
 pub struct LatentFeatures {
     centre: Vec<f32>,
     scale: Vec<f32>,
-    /// Features that count when the model is evaluated: dynamic, and not the orientation of a cube.
-    evaluated: Vec<usize>,
     /// Features that networks read through symlog.
     raw: Vec<usize>,
     /// The differences, read a second time through a tanh.
@@ -54,8 +52,6 @@ impl LatentFeatures {
             cubes: Cube::find(spec, &dynamic),
             centre: features.iter().map(|feature| feature.centre).collect(),
             scale: features.iter().map(|feature| feature.scale).collect(),
-            // Reconstructed in canonical form, so that a comparison with observations would be meaningless.
-            evaluated: dynamic.into_iter().filter(|i| features[*i].cube.is_none()).collect(),
             raw: (0..features.len()).filter(|i| derived.iter().all(|[index, ..]| index != i)).collect(),
             near,
             derived,
@@ -96,12 +92,6 @@ impl LatentFeatures {
             }
         }
         obs
-    }
-
-    /// The features that [open-loop evaluation](crate::model::open_loop) compares, each with a noticeable change of it (a
-    /// tenth of its scale).
-    pub fn evaluated(&self) -> Vec<(usize, f32)> {
-        self.evaluated.iter().map(|&i| (i, 0.1 * self.scale[i])).collect()
     }
 }
 

@@ -18,7 +18,9 @@ use crate::rng::Rng;
 pub struct WorldModelLoss {
     /// The squared error of the decoded observation, summed over its numbers, in the networks' units (symlog and scaled).
     pub reconstruction: Tensor3,
-    /// The cross-entropy of the reward's two-hot distribution.
+    /// The cross-entropy of the reward's two-hot distribution. At the first time step of an episode its target is 0, as in
+    /// the published code, although a sequence that begins within an episode starts from the same blank state with a reward.
+    /// Nothing reads the prediction there: imagined returns begin with the reward of the next state.
     pub reward: Tensor3,
     /// The binary cross-entropy of the continuation, whose target is the discount, or 0 where the task ended.
     pub continuation: Tensor3,

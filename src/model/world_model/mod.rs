@@ -154,10 +154,6 @@ impl WorldModel {
 }
 
 impl OpenLoopModel for WorldModel {
-    fn predicted_features(&self) -> Vec<(usize, f32)> {
-        self.obs_features.evaluated()
-    }
-
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], ahead: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
         // Each particle draws its own latent states from the posterior, too.
         let rows: Vec<(&Episode, usize)> = starts.repeat(PARTICLES);
