@@ -97,7 +97,7 @@ fn planners() -> [(&'static str, PlannerConfig, f32); 3] {
         ..MppiConfig::default()
     };
     [
-        ("CEM", PlannerConfig::Cem(cem), 0.05),
+        ("CEM", PlannerConfig::Cem(cem), 0.1),
         ("iCEM", PlannerConfig::Icem(icem), 0.25),
         ("MPPI", PlannerConfig::Mppi(mppi), 0.15),
     ]

@@ -70,9 +70,9 @@ fn the_std_of_noise_grows_with_the_root_of_time() {
     let dynamics = disagreeing(0.0, 0.5);
     for propagation in [Propagation::TsInf, Propagation::Ts1, Propagation::MomentMatching] {
         let mut rng = rng::stream(1, "chance");
-        let (trajectories, _) = imagine(&dynamics, propagation, 1000).trajectories(&[0.0], &[0.0; 9], 9, &mut rng);
+        let (trajectories, _) = imagine(&dynamics, propagation, 4000).trajectories(&[0.0], &[0.0; 9], 9, &mut rng);
         let (_, std) = mean_and_std(&trajectories[9]);
-        assert!((std - 1.5).abs() < 0.15, "{propagation:?}: {std}");
+        assert!((std - 1.5).abs() < 0.2, "{propagation:?}: {std}");
     }
 }
 
