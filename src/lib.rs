@@ -89,7 +89,7 @@
 //! - Agents, evaluation, runs, replays and the study know an environment by its traits alone.
 //! - A planner never sees an environment: it maximises a closure.
 //! - No global state: every random number comes from a generator that was passed in, and one seed
-//!   fixes a run bit for bit on one machine.
+//!   fixes a run bit for bit, with any number of threads, with AVX2 and with AVX-512.
 //! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
 //! - Libraries return [`error::Error`]s; a panic is a bug.
 #![warn(missing_debug_implementations, missing_docs)]
