@@ -161,6 +161,16 @@ fn train_evaluate_and_watch() {
     assert_eq!(frames.len(), 151);
     assert!(frames.iter().all(|frame| frame["poses"].as_array().is_some_and(|poses| poses.len() == bodies.len())));
 
+    // Other random numbers make another run.
+    let shaken = Command::new(env!("CARGO_BIN_EXE_handful"))
+        .current_dir(here)
+        .args(["train", "--task", "push", "--method", "debug", "--steps", "300", "--out", "run"])
+        .env(handful::rng::SHAKE, "65535")
+        .output()
+        .expect("the program starts");
+    let said = text(&shaken.stderr);
+    assert!(shaken.status.code() == Some(2) && said.contains("another run (its `shake` is"), "{said}");
+
     // A checkpoint that is not one of ours.
     std::fs::write(here.join("run/weights.safetensors"), b"something else").expect("a writable folder");
     refused(here, &["evaluate", "--run", "run"], &["weights.safetensors", "damaged"]);

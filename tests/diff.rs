@@ -14,6 +14,7 @@ use handful::env::{Env, Snapshot};
 use handful::plan::noise::ColoredNoise;
 use handful::rng::{self, Rng, uniform};
 use nalgebra::SVector;
+use rayon::prelude::*;
 
 const STEPS: usize = 50;
 
@@ -146,8 +147,7 @@ fn ilqr_pushes_the_block_to_random_goals() {
     const GOALS: usize = 100;
     let mut rng = rng::stream(4, "diff");
     let ilqr = Ilqr::new(IlqrConfig { iterations: 60, tolerance: 1e-4, ..IlqrConfig::default() });
-    let (mut reached, mut steps) = (0, 0);
-    for _ in 0..GOALS {
+    let mut problem = || {
         let direction = uniform(&mut rng, -PI, PI);
         let distance = uniform(&mut rng, 0.05, 0.15);
         let task =
@@ -156,10 +156,14 @@ fn ilqr_pushes_the_block_to_random_goals() {
         let from = uniform(&mut rng, -PI, PI);
         (start[0], start[1]) = (0.07 * from.cos(), 0.07 * from.sin());
         start[4] = uniform(&mut rng, -0.78, 0.78);
-        let found = ilqr.solve(&task, &start, &task.guess(&start, 60));
-        steps += found.steps;
-        reached += usize::from(task.distance(&found.states[60]) < 0.01);
-    }
+        (task, start)
+    };
+    let problems: Vec<_> = (0..GOALS).map(|_| problem()).collect();
+    let solve = |(task, start): &(PusherTask, SVector<f64, STATE>)| {
+        let found = ilqr.solve(task, start, &task.guess(start, 60));
+        (usize::from(task.distance(&found.states[60]) < 0.01), found.steps)
+    };
+    let (reached, steps) = problems.par_iter().map(solve).reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
     println!("{reached} of {GOALS} goals within 1 cm, {} steps each", steps / GOALS);
     assert!(reached >= 95, "{reached} of {GOALS} goals are reached within 1 cm");
 }

@@ -18,6 +18,7 @@ use handful::study::statistics::{
     area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference, ratio_of_means,
     restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
 };
+use rayon::prelude::*;
 
 fn near(what: &str, ours: f64, theirs: f64, tolerance: f64) {
     assert!((ours - theirs).abs() <= tolerance, "{what}: {ours}, expected {theirs}");
@@ -324,16 +325,16 @@ fn finish(config: &RunConfig, folder: &Path) {
 /// Also evaluations in the middle of an episode, which lasts 100 steps here.
 #[test]
 fn evaluations_do_not_disturb_training() {
-    for config in small_runs() {
+    small_runs().par_iter().for_each(|config| {
         let folder = tempfile::tempdir().expect("a folder");
-        let learned = [70, 400].map(|evaluate_every| {
+        let learned = [130, 400].map(|evaluate_every| {
             let folder = folder.path().join(evaluate_every.to_string());
             let few = RunConfig { evaluate_every, evaluation_episodes: 2, test_episodes: 2, ..config.clone() };
             finish(&few, &folder);
             std::fs::read(folder.join("weights.safetensors")).expect("weights")
         });
         assert!(learned[0] == learned[1], "{}", config.method);
-    }
+    });
 }
 
 /// A run that helps to choose settings meets neither the curve's starts nor the test's.

@@ -6,6 +6,9 @@ use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail, ensure};
@@ -41,11 +44,11 @@ pub fn take(root: &Path, shakes: u16) -> Result<()> {
     let mut columns = Vec::new();
     for (kernels, features) in [("AVX-512", "avx512,cli,study"), ("AVX2", "cli,study")] {
         let mut records = Records::new();
-        for program in build(root, features)? {
-            for shake in 1..=shakes {
-                let output = output(root, &program, shake)?;
-                count(&mut records, &program.source, shake, &output)?;
-            }
+        let programs = build(root, features)?;
+        let jobs: Vec<(&Program, u16)> =
+            (1..=shakes).flat_map(|shake| programs.iter().map(move |p| (p, shake))).collect();
+        for ((program, shake), output) in jobs.iter().zip(outputs(root, &jobs)) {
+            count(&mut records, &program.source, *shake, &output?)?;
         }
         columns.push((kernels, records));
     }
@@ -88,6 +91,24 @@ fn build(root: &Path, features: &str) -> Result<Vec<Program>> {
     Ok(programs)
 }
 
+/// What each program prints under each shake: as many at once as the machine has cores, each on one thread.
+fn outputs(root: &Path, jobs: &[(&Program, u16)]) -> Vec<Result<String>> {
+    let next = AtomicUsize::new(0);
+    let outputs: Vec<OnceLock<Result<String>>> = jobs.iter().map(|_| OnceLock::new()).collect();
+    thread::scope(|scope| {
+        for _ in 0..thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(|| {
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some((program, shake)) = jobs.get(index) else { break };
+                    let _ = outputs[index].set(output(root, program, *shake));
+                }
+            });
+        }
+    });
+    outputs.into_iter().map(|output| output.into_inner().expect("every job was done")).collect()
+}
+
 /// What a program prints under a shake; from the last census, if it has not changed since.
 fn output(root: &Path, program: &Program, shake: u16) -> Result<String> {
     let mut hash = DefaultHasher::new();
@@ -98,7 +119,9 @@ fn output(root: &Path, program: &Program, shake: u16) -> Result<String> {
     }
     let began = Instant::now();
     let output = Command::new(&program.file)
+        .arg("--test-threads=1")
         .env("HANDFUL_SHAKE", shake.to_string())
+        .env("RAYON_NUM_THREADS", "1")
         .env("RUST_BACKTRACE", "0")
         .current_dir(&program.folder)
         .output()

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use crate::error::{Error, Result};
 use crate::study::registry::Registry;
+use crate::study::starts::EvalSeeds;
 use crate::watch::Recording;
 
 #[derive(clap::Args)]
@@ -17,7 +18,7 @@ pub(super) struct Args {
     /// That policy: scripted or random
     #[arg(long, default_value = "scripted", conflicts_with = "run")]
     policy: String,
-    /// The episode's seed
+    /// The seed of the initial state: the first that `evaluate --seed` meets with it
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// The file [default: NAME.html]
@@ -43,7 +44,8 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
         (None, None) => unreachable!("the command line asks for one of them"),
     };
     let title = format!("{}, {}, seed {}", config.task, config.method, args.seed);
-    let recording = Recording::of_episode(title, registry.make_env(&config)?, &mut method, args.seed)?;
+    let reset_seed = EvalSeeds::Seed(args.seed).seed(0)?;
+    let recording = Recording::of_episode(title, registry.make_env(&config)?, &mut method, reset_seed)?;
     let path = args.out.clone().unwrap_or(default);
     recording.write(&path)?;
     let outcome = if recording.success() { "success" } else { "no success" };

@@ -35,6 +35,9 @@ pub struct RunConfig {
     /// The initial states of evaluations and test: `test`, or `development` for a run that helps to choose settings.
     #[serde(default)]
     pub starts: Starts,
+    /// What [`SHAKE`](crate::rng::SHAKE) was when the run began; it is resumed with the same.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub shake: u64,
     /// Options of the environment.
     #[serde(default)]
     pub env: Table,
@@ -53,6 +56,10 @@ fn default_evaluation_episodes() -> usize {
 
 fn default_test_episodes() -> usize {
     100
+}
+
+fn is_zero(number: &u64) -> bool {
+    *number == 0
 }
 
 impl RunConfig {

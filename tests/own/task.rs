@@ -199,6 +199,11 @@ fn it_is_run_by_name() {
         .env(EnvEntry::table_task(touch))
         .preset("script", "agent = \"scripted\"\nsteps = 0\ntest_episodes = 5\n")
         .preset(
+            "planner",
+            "agent = \"oracle\"\nsteps = 0\n[oracle.control]\naction_repeat = 2\n\
+             [oracle.planner.icem]\nhorizon = 6\npopulation = 16\nelites = 4\niterations = 2\n",
+        )
+        .preset(
             "small",
             "agent = \"sac\"\nsteps = 120\nevaluation_episodes = 1\ntest_episodes = 2\n[sac]\nhidden = [8]\n",
         );
@@ -213,7 +218,7 @@ fn it_is_run_by_name() {
         };
         assert!(method == "small" || test.success == 1.0, "the script solves it: {test:?}");
     }
-    let config = registry.config(&name, "oracle", 0, None, None).expect("a preset");
+    let config = registry.config(&name, "planner", 0, None, None).expect("a preset");
     let mut oracle = registry.method(&config).expect("an oracle");
     let mut evaluator = Evaluator::new(|| registry.make_env(&config)).expect("the task");
     let evaluation = evaluator.evaluate(&mut oracle, 1, EvalSeeds::Test).expect("valid actions");

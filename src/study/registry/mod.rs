@@ -36,6 +36,7 @@ use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, merge, preset_t
 use crate::checkpoint::Weights;
 use crate::env::Env;
 use crate::error::{Error, Result};
+use crate::rng;
 
 /// Environments, agents and presets by name.
 pub struct Registry {
@@ -149,6 +150,7 @@ impl Registry {
         }
         table.insert("task".into(), Value::String(task.into()));
         table.insert("method".into(), Value::String(method.into()));
+        table.insert("shake".into(), Value::Integer(rng::shake() as i64));
         // TOML's integers are signed: what does not fit would come out negative.
         for (field, value) in [("seed", Some(seed)), ("steps", steps.map(|steps| steps as u64))] {
             if let Some(value) = value {
