@@ -175,8 +175,8 @@ fn the_best_members_predict_and_all_survive_a_save() {
     assert!((before.mean[0] - after.mean[0]).abs() < 0.05, "a second fit goes on from the first");
 }
 
-/// Where there is nothing to learn but noise, an ensemble memorises it fit after fit. Its validation error must tell: it is
-/// the error on transitions that it has never seen. (Drawn anew for every fit, the validation set would tell 0.8 of it.)
+/// On few and noisy data an ensemble memorises noise, fit after fit. Its validation error must tell: it is the error on
+/// transitions that it has never seen.
 #[test]
 fn the_validation_set_stays_unseen() {
     // The validation error and the true one, for one ensemble on data of its own.
@@ -184,8 +184,16 @@ fn the_validation_set_stays_unseen() {
         let mut rng = rng::stream(seed, "model");
         let mut transition = || {
             let mut noise = || rng::uniform(&mut rng, -1.0, 1.0) as f32;
-            let (obs, next_obs, action) = (seen(noise(), noise()), seen(noise(), noise()), vec![noise()]);
-            Transition { obs, action, reward: 0.0, next_obs, terminated: false, truncated: false }
+            let ([x, v], action) = ([noise(), noise()], noise());
+            let next_obs = seen(x + 0.5 * v + 0.5 * noise(), v + 0.5 * action + 0.5 * noise());
+            Transition {
+                obs: seen(x, v),
+                action: vec![action],
+                reward: 0.0,
+                next_obs,
+                terminated: false,
+                truncated: false,
+            }
         };
         let mut data = ReplayBuffer::new(4, 1, 400);
         (0..400).for_each(|_| data.push(&transition()));
@@ -217,7 +225,7 @@ fn the_validation_set_stays_unseen() {
     };
     let all: Vec<(f64, f64)> = (11..19).into_par_iter().map(errors).collect();
     let ratio = all.iter().map(|(claimed, truth)| claimed / truth).sum::<f64>() / all.len() as f64;
-    assert!(ratio > 0.88, "a validation error is {ratio:.2} of the error on other transitions");
+    assert!(ratio > 0.85, "a validation error is {ratio:.2} of the error on other transitions");
 }
 
 /// A flag that flips once in three hundred steps: its change is 17 standard deviations, and yet it is predicted in full.
