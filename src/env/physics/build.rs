@@ -18,6 +18,7 @@ impl Physics {
         let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -GRAVITY as f32), ..PhysicsWorld::default() };
         let settings = &mut world.integration_parameters;
         settings.dt = TIMESTEP as f32;
+        settings.num_solver_iterations = 1;
         settings.num_internal_pgs_iterations = 4;
         // Contact springs scale with the mass at the contact; a cube of 64 g needs a stiff one.
         settings.contact_softness = SpringCoefficients::new(100.0, 5.0);

@@ -19,6 +19,7 @@
 
 mod build;
 mod convert;
+mod grip;
 mod step;
 
 use nalgebra::Vector3;

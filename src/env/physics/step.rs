@@ -6,11 +6,6 @@ use rapier3d::prelude::*;
 use super::{JointState, Physics, SIDES, TIMESTEP};
 use crate::env::arm::{GripperDescription, JOINTS, JointVector};
 
-/// Substeps of the solver in a physics step. A grasp needs more: the hand moves on arcs, a held
-/// object in straight lines from substep to substep, and the difference is slip.
-const SUBSTEPS: usize = 1;
-const SUBSTEPS_HOLDING: usize = 6;
-
 /// A joint limit counts as near at this distance, far more than a joint moves in one step: rad, m.
 const HINGE_MARGIN: f64 = 0.1;
 const SLIDE_MARGIN: f64 = 0.005;
@@ -65,15 +60,11 @@ impl Physics {
             finger.add_force(push, true);
             bodies[self.links[JOINTS - 1]].add_force_at_point(-push, at, true);
         }
-        self.world.integration_parameters.num_solver_iterations =
-            if self.holding() { SUBSTEPS_HOLDING } else { SUBSTEPS };
+        let grip = self.grip();
         self.world.step();
-    }
-
-    /// Whether a pad touches anything.
-    fn holding(&self) -> bool {
-        let mut pairs = self.pads.iter().flat_map(|&pad| self.world.narrow_phase.contact_pairs_with(pad));
-        pairs.any(|pair| pair.total_impulse_magnitude() > 0.0)
+        if let Some(grip) = grip {
+            grip.carry(self);
+        }
     }
 
     /// Tells the solver only of those joint limits that are near: each costs it a row in every
