@@ -23,13 +23,12 @@ pub(super) struct Grip {
 impl Physics {
     /// The grip of the hand, if it holds something.
     pub(super) fn grip(&self) -> Option<Grip> {
-        let PhysicsWorld { narrow_phase, colliders, bodies, .. } = &self.world;
-        let touched = |pad: ColliderHandle| {
-            let pairs = narrow_phase.contact_pairs_with(pad).filter(|pair| pair.total_impulse_magnitude() > 0.0);
-            pairs.map(move |pair| if pair.collider1 == pad { pair.collider2 } else { pair.collider1 })
+        let PhysicsWorld { colliders, bodies, .. } = &self.world;
+        let pressed = |pad: ColliderHandle| {
+            self.touched(pad).filter(|(_, pair)| pair.total_impulse_magnitude() > 0.0).map(|(other, _)| other)
         };
         let [left, right] = self.pads;
-        let both = touched(left).find(|one| touched(right).any(|other| other == *one))?;
+        let both = pressed(left).find(|one| pressed(right).any(|other| other == *one))?;
         let object = colliders[both].parent().filter(|body| bodies[*body].is_dynamic())?;
         Some(Grip {
             object,
