@@ -1,12 +1,14 @@
 //! The arm against robosuite's: kinematics, inertia, step responses, fingers, grasp.
 //! The reference numbers stand in `data/reference/panda.toml`.
 
-use handful::env::Env;
+use std::f64::consts::PI;
+
 use handful::env::arm::{ArmDescription, JointVector, Pose};
-use handful::env::kinematics::{KinematicModel, Kinematics};
+use handful::env::kinematics::{GRAVITY, KinematicModel, Kinematics};
 use handful::env::osc::{Goal, OperationalSpaceController};
-use handful::env::physics::{Physics, STEPS_PER_CONTROL};
+use handful::env::physics::{Physics, STEPS_PER_CONTROL, TABLE_HALF, TABLE_TOP, TIMESTEP};
 use handful::env::tabletop::{ActionKind, Lift, TableOptions, Tabletop};
+use handful::env::{Env, Task, World};
 use handful::rng;
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -231,7 +233,7 @@ fn without_an_action_the_arm_holds_still() {
 fn grasped(seed: u64) -> Tabletop {
     let mut env = Tabletop::new(Lift, TableOptions { horizon: Some(10_000), ..TableOptions::default() })
         .expect("options for lift");
-    let policy = handful::env::Task::Lift.scripted_policy(TableOptions::default()).expect("lift has one");
+    let policy = Task::Lift.scripted_policy(TableOptions::default()).expect("lift has one");
     let mut obs = env.reset(seed);
     for _ in 0..60 {
         obs = env.step(&policy(&obs)).expect("a valid action").observation;
@@ -272,12 +274,114 @@ fn a_grasped_cube_does_not_slip() {
         column.sort_by(f64::total_cmp);
         [column[0], column[column.len() / 2], column[column.len() - 1]]
     });
-    // The bounds of the worst hold with room for what 180 grasps showed: 1.7 mm, 5.1 degrees, 1.54 mm, 8.5 N. The motors press
+    // The bounds of the worst hold with room for what 180 grasps showed: 0.4 mm, 5.6 degrees, 1.04 mm, 12.5 N. The motors press
     // with 20 N; what arrives at a pad depends on how the cube lies in the hand.
-    assert!(slip[1] < 1.0 && slip[2] < 3.0, "slips, in mm: least, median, most {slip:.2?}");
+    assert!(slip[1] < 0.3 && slip[2] < 1.0, "slips, in mm: least, median, most {slip:.2?}");
     assert!(turn[1] < 1.0 && turn[2] < 10.0, "turns, in degrees: {turn:.2?}");
-    assert!(sunk[1] < 1.2 && sunk[2] < 2.0, "the pads sink in, in mm: {sunk:.2?}");
-    assert!(force[0] > 5.0 && (14.0..20.0).contains(&force[1]) && force[2] < 20.0, "a pad presses, in N: {force:.1?}");
+    assert!(sunk[1] < 1.0 && sunk[2] < 1.5, "the pads sink in, in mm: {sunk:.2?}");
+    assert!(force[0] > 9.0 && (14.0..20.0).contains(&force[1]) && force[2] < 20.0, "a pad presses, in N: {force:.1?}");
+}
+
+/// The hand comes down on a cube at full speed and presses on, with fingers closed, open or moving, straight, scraping, or
+/// in jabs: how deep the lowest corner of a cube is pressed into the table, m, at worst in a hundred control steps.
+fn pressed_in(task: Task, seed: u64) -> f64 {
+    let options = TableOptions { horizon: Some(usize::MAX), ..TableOptions::default() };
+    let World::Tabletop(mut env) = task.make_with(options).expect("an arm task") else { unreachable!("an arm task") };
+    let mut rng = rng::stream(seed, "press");
+    env.reset(seed);
+    let cubes = env.setup().objects.clone();
+    let target = cubes[seed as usize / 2 % cubes.len()];
+    let (style, off_centre) = (seed / 4 % 4, [0.0, 0.01, 0.02][seed as usize / 16 % 3]);
+    let side = rng::uniform(&mut rng, -PI, PI);
+    let (mut pressing, mut deepest) = (None, f64::NEG_INFINITY);
+    for step in 0..150 {
+        let cube = env.physics().object_state(target).pose.translation.vector;
+        let over = cube + Vector3::new(off_centre * side.cos(), off_centre * side.sin(), 0.09);
+        let way = (over - Vector3::from(env.hand().expect("a hand"))) * 12.0;
+        let grip = [1.0, 1.0, -1.0, 0.0][seed as usize % 4];
+        let mut action = [way.x, way.y, way.z, grip];
+        if way.norm() < 0.12 || step == 50 {
+            pressing = pressing.or(Some(step));
+        }
+        if let Some(since) = pressing {
+            if step == since + 100 {
+                break;
+            }
+            action[2] = -1.0;
+            let t = f64::from(step);
+            match style {
+                1 => (action[0], action[1]) = ((0.3 * t).sin(), (0.23 * t).cos()),
+                2 => {
+                    (action[0], action[1]) = (way.x + 0.3 * rng::normal(&mut rng), way.y + 0.3 * rng::normal(&mut rng));
+                    action[2] = if step / 5 % 2 == 0 { -1.0 } else { 0.5 };
+                }
+                3 => action[3] = if step / 8 % 2 == 0 { 1.0 } else { -1.0 },
+                _ => {}
+            }
+        }
+        env.step(&action.map(|a| a.clamp(-1.0, 1.0) as f32)).expect("a valid action");
+        if pressing.is_some() {
+            for cube in &cubes {
+                let pose = env.physics().object_state(*cube).pose;
+                let [x, y, z] = pose.translation.vector.into();
+                // A cube that was pushed off the table lies on the floor.
+                if x.abs() < TABLE_HALF[0] && y.abs() < TABLE_HALF[1] && z > TABLE_TOP - TABLE_HALF[2] {
+                    let half = 0.02 * pose.rotation.to_rotation_matrix().matrix().row(2).abs().sum();
+                    deepest = f64::max(deepest, TABLE_TOP - (z - half));
+                }
+            }
+        }
+    }
+    deepest
+}
+
+/// As many control steps of pressing as an earlier version was tried with: there, a cube sank by up to 32 mm.
+#[test]
+fn no_cube_is_pressed_into_the_table() {
+    let episodes: Vec<(Task, u64)> = [Task::Lift, Task::Stack, Task::Push]
+        .into_iter()
+        .flat_map(|task| (0..38).map(move |seed| (task, seed)))
+        .collect();
+    let mut depths: Vec<f64> = episodes.into_par_iter().map(|(task, seed)| pressed_in(task, seed)).collect();
+    depths.sort_by(f64::total_cmp);
+    // Over 72,000 control steps, with five shakes, it was 1.9 mm.
+    let worst = 1e3 * depths[depths.len() - 1];
+    println!("pressed in by {worst:.2} mm");
+    assert!(worst < 3.0, "pressed in by {worst:.2} mm");
+}
+
+/// Friction carries what the pads can carry, and no more: a cube falls out of a hand at rest with the acceleration
+/// g - 2 mu N / m, or stays.
+#[test]
+fn what_is_too_heavy_slides_out_of_the_hand() {
+    let mut arm = ArmDescription::panda();
+    arm.gripper.pad_friction = 0.2;
+    let (half, steps) = (0.02, 10);
+    for density in [1000.0, 20_000.0] {
+        let mut physics = Physics::new(arm.clone());
+        let grip = physics.kinematics(&arm.home).grip;
+        let cube = physics.add_box([half; 3], density, 0.2, &grip);
+        physics.set_joints(&arm.home, [half + 1e-4; 2]);
+        let goal = Goal { position: grip.translation.vector, orientation: grip.rotation };
+        let controller = OperationalSpaceController::new(&arm, goal, arm.home);
+        let (mut speed, mut force) = (0.0, 0.0);
+        // The pads close on the cube while the first steps pass.
+        for step in 0..10 + steps {
+            let joints = physics.joint_state();
+            let torques = controller.torques(&physics.kinematics(&joints.q), &joints.q, &joints.qd);
+            physics.step(&torques, [-20.0; 2]);
+            let pads: f64 = physics.pad_forces(cube).iter().sum();
+            if step < 10 {
+                speed = physics.object_state(cube).velocity.z;
+            } else {
+                force += pads / f64::from(steps);
+            }
+        }
+        let found = -(physics.object_state(cube).velocity.z - speed) / (f64::from(steps) * TIMESTEP);
+        let mass = density * (2.0 * half).powi(3);
+        let expected = (GRAVITY - 0.2 * force / mass).max(0.0);
+        assert!((found - expected).abs() < 0.1, "{mass:.2} kg under {force:.1} N: {found:.2} m/s2, not {expected:.2}");
+    }
 }
 
 #[test]

@@ -24,6 +24,7 @@
 //! assert!(solution.cost < 0.9 * cost);
 //! ```
 
+pub mod arm;
 pub mod derivatives;
 mod identify;
 mod ilqr;
@@ -34,6 +35,7 @@ mod swing;
 
 use nalgebra::{RealField, SVector};
 
+pub use arm::{FreeArm, ReachTask};
 pub use identify::{Identified, RecordedPush};
 pub use ilqr::{Ilqr, IlqrConfig, IlqrControl, Solution};
 pub use policy::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PolicyEnv};

@@ -13,7 +13,9 @@
 //! assert!((mass - 14.8).abs() < 1e-9, "{mass} kg with the hand");
 //! ```
 
-use nalgebra::{Isometry3, Matrix3, Quaternion, SVector, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{
+    Isometry3, Matrix3, Point3, Quaternion, RealField, SVector, Translation3, UnitQuaternion, Vector3, convert,
+};
 
 /// Joints of the arms described here (the gripper's two fingers not counted).
 pub const JOINTS: usize = 7;
@@ -70,15 +72,15 @@ impl Primitive {
     }
 }
 
-/// Mass, centre of mass and inertia of a rigid body, all in the body's own frame.
+/// Mass, centre of mass and inertia of a rigid body, all in the body's own frame, in any kind of number.
 #[derive(Clone, Copy, Debug)]
-pub struct Inertia {
+pub struct Inertia<S = f64> {
     /// Mass, kg.
-    pub mass: f64,
+    pub mass: S,
     /// Centre of mass, m.
-    pub com: Vector3<f64>,
+    pub com: Vector3<S>,
     /// Inertia about the centre of mass, kg m2.
-    pub tensor: Matrix3<f64>,
+    pub tensor: Matrix3<S>,
 }
 
 impl Inertia {
@@ -87,12 +89,19 @@ impl Inertia {
         Self { mass, com: com.into(), tensor: Matrix3::from_diagonal(&principal.into()) }
     }
 
+    /// The same body in numbers of another kind.
+    pub fn cast<S: RealField + Copy>(&self) -> Inertia<S> {
+        Inertia { mass: convert(self.mass), com: self.com.map(convert), tensor: self.tensor.map(convert) }
+    }
+}
+
+impl<S: RealField + Copy> Inertia<S> {
     /// The same body in a frame in which its own frame has pose `pose`.
-    pub fn seen_at(&self, pose: &Pose) -> Self {
+    pub fn seen_at(&self, pose: &Isometry3<S>) -> Self {
         let r = pose.rotation.to_rotation_matrix();
         Self {
             mass: self.mass,
-            com: (pose * nalgebra::Point3::from(self.com)).coords,
+            com: (pose * Point3::from(self.com)).coords,
             tensor: r.matrix() * self.tensor * r.matrix().transpose(),
         }
     }

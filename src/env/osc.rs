@@ -20,10 +20,10 @@
 //! assert!(controller.torques(&home, &arm.home, &JointVector::zeros()).norm() > 1.0);
 //! ```
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, RealField, SMatrix, SVector, UnitQuaternion, Vector3, Vector6, convert};
 
-use super::arm::{ArmDescription, JOINTS, JointVector};
-use super::kinematics::Kinematics;
+use super::arm::{ArmDescription, JOINTS};
+use super::kinematics::{Kinematics, cast_rotation};
 
 /// Stiffness of the hand's spring per unit of inertia, 1/s2, for position and for orientation.
 const STIFFNESS: f64 = 150.0;
@@ -32,11 +32,11 @@ const POSTURE_STIFFNESS: f64 = 10.0;
 
 /// The goal of the hand: position (m) and orientation of the grip site, world frame.
 #[derive(Clone, Copy, Debug)]
-pub struct Goal {
+pub struct Goal<S: RealField = f64> {
     /// Position of the grip site.
-    pub position: Vector3<f64>,
+    pub position: Vector3<S>,
     /// Orientation of the grip site.
-    pub orientation: UnitQuaternion<f64>,
+    pub orientation: UnitQuaternion<S>,
 }
 
 /// The controller: fixed impedance, critically damped, position and orientation decoupled.
@@ -44,23 +44,37 @@ pub struct Goal {
 #[doc(alias = "OSC_POSE")]
 #[doc(alias = "Khatib")]
 #[derive(Clone, Debug)]
-pub struct OperationalSpaceController {
+pub struct OperationalSpaceController<S: RealField = f64> {
     /// The goal of the hand.
-    pub goal: Goal,
+    pub goal: Goal<S>,
     /// The joint angles that the null space is drawn to, rad.
-    pub posture: JointVector,
-    max_torque: JointVector,
+    pub posture: SVector<S, JOINTS>,
+    max_torque: SVector<S, JOINTS>,
 }
 
 impl OperationalSpaceController {
+    /// The same controller in numbers of another kind.
+    pub fn cast<S: RealField + Copy>(&self) -> OperationalSpaceController<S> {
+        let goal =
+            Goal { position: self.goal.position.map(convert), orientation: cast_rotation(&self.goal.orientation) };
+        OperationalSpaceController {
+            goal,
+            posture: self.posture.map(convert),
+            max_torque: self.max_torque.map(convert),
+        }
+    }
+}
+
+impl<S: RealField + Copy> OperationalSpaceController<S> {
     /// A controller that keeps `goal` and `posture` until they are changed.
-    pub fn new(arm: &ArmDescription, goal: Goal, posture: JointVector) -> Self {
-        Self { goal, posture, max_torque: JointVector::from_iterator(arm.links.iter().map(|link| link.max_torque)) }
+    pub fn new(arm: &ArmDescription, goal: Goal<S>, posture: SVector<S, JOINTS>) -> Self {
+        let max_torque = SVector::from_iterator(arm.links.iter().map(|link| convert(link.max_torque)));
+        Self { goal, posture, max_torque }
     }
 
     /// Joint torques (N m), beyond those that carry its weight, for the arm at joint angles `q` (rad), moving at `qd` (rad/s), whose
     /// kinematics are `at`. Motors saturate at their largest torque.
-    pub fn torques(&self, at: &Kinematics, q: &JointVector, qd: &JointVector) -> JointVector {
+    pub fn torques(&self, at: &Kinematics<S>, q: &SVector<S, JOINTS>, qd: &SVector<S, JOINTS>) -> SVector<S, JOINTS> {
         let torque = self.operational_space_torque(at, q, qd);
         // A motor that already carries the arm has less to spare in that direction.
         let motor =
@@ -75,47 +89,54 @@ impl OperationalSpaceController {
     /// with the operational-space inertia L = (J M^-1 J')^-1. Deviation, as in robosuite: position and orientation are
     /// decoupled, each with the inertia (Lp, Lr) that it would have without the other; only the null-space projection, which
     /// keeps the posture's acceleration a0 from moving the hand, has both together.
-    fn operational_space_torque(&self, at: &Kinematics, q: &JointVector, qd: &JointVector) -> JointVector {
+    fn operational_space_torque(
+        &self,
+        at: &Kinematics<S>,
+        q: &SVector<S, JOINTS>,
+        qd: &SVector<S, JOINTS>,
+    ) -> SVector<S, JOINTS> {
         let (force, moment) = self.accelerations(at, qd);
 
-        let mut jacobian = SMatrix::<f64, 6, JOINTS>::zeros();
+        let mut jacobian = SMatrix::<S, 6, JOINTS>::zeros();
         jacobian.fixed_rows_mut::<3>(0).copy_from(&at.linear);
         jacobian.fixed_rows_mut::<3>(3).copy_from(&at.angular);
         let inverse_mass = at.mass.cholesky().expect("a mass matrix is positive definite");
         // The mobility J M^-1 J' is the inverse of the operational-space inertia; what follows solves instead of inverting.
-        let mobility: Matrix6<f64> = jacobian * inverse_mass.solve(&jacobian.transpose());
-        let for_position: Matrix3<f64> = mobility.fixed_view::<3, 3>(0, 0).into();
-        let for_rotation: Matrix3<f64> = mobility.fixed_view::<3, 3>(3, 3).into();
+        let mobility: Matrix6<S> = jacobian * inverse_mass.solve(&jacobian.transpose());
+        let for_position: Matrix3<S> = mobility.fixed_view::<3, 3>(0, 0).into();
+        let for_rotation: Matrix3<S> = mobility.fixed_view::<3, 3>(3, 3).into();
 
         let task =
             at.linear.transpose() * solve(for_position, force) + at.angular.transpose() * solve(for_rotation, moment);
 
-        let posture = (self.posture - q) * POSTURE_STIFFNESS - qd * (2.0 * POSTURE_STIFFNESS.sqrt());
-        let felt: Vector6<f64> = jacobian * posture;
+        let posture = (self.posture - q) * convert::<f64, S>(POSTURE_STIFFNESS)
+            - qd * convert::<f64, S>(2.0 * POSTURE_STIFFNESS.sqrt());
+        let felt: Vector6<S> = jacobian * posture;
         let null_space = at.mass * posture - jacobian.transpose() * solve(mobility, felt);
         task + null_space
     }
 
     /// The linear (m/s2) and angular (rad/s2) acceleration that a critically damped spring gives the hand: Fp and Fr above.
-    fn accelerations(&self, at: &Kinematics, qd: &JointVector) -> (Vector3<f64>, Vector3<f64>) {
-        let damping = 2.0 * STIFFNESS.sqrt();
+    fn accelerations(&self, at: &Kinematics<S>, qd: &SVector<S, JOINTS>) -> (Vector3<S>, Vector3<S>) {
+        let [stiffness, damping] = [STIFFNESS, 2.0 * STIFFNESS.sqrt()].map(convert::<f64, S>);
         let position_error = self.goal.position - at.grip.translation.vector;
         let rotation_error = rotation_error(&at.grip.rotation, &self.goal.orientation);
-        let force = position_error * STIFFNESS - at.linear * qd * damping;
-        let moment = rotation_error * STIFFNESS - at.angular * qd * damping;
+        let force = position_error * stiffness - at.linear * qd * damping;
+        let moment = rotation_error * stiffness - at.angular * qd * damping;
         (force, moment)
     }
 }
 
 /// Solves `mobility x = b`. The ridge keeps a stretched-out arm, whose mobility is singular, from
 /// answering with infinite forces; elsewhere it is far below the arm's own mobility (about 0.03/kg).
-fn solve<const N: usize>(mobility: SMatrix<f64, N, N>, b: SMatrix<f64, N, 1>) -> SMatrix<f64, N, 1> {
-    let ridge = SMatrix::<f64, N, N>::identity() * 1e-6;
+fn solve<S: RealField + Copy, const N: usize>(mobility: SMatrix<S, N, N>, b: SVector<S, N>) -> SVector<S, N> {
+    let ridge = SMatrix::<S, N, N>::identity() * convert::<f64, S>(1e-6);
     (mobility + ridge).cholesky().expect("a mobility matrix is positive semi-definite").solve(&b)
 }
 
 /// The rotation that is missing from `now` to `goal`: sin(angle) times the axis, world frame.
-fn rotation_error(now: &UnitQuaternion<f64>, goal: &UnitQuaternion<f64>) -> Vector3<f64> {
+fn rotation_error<S: RealField + Copy>(now: &UnitQuaternion<S>, goal: &UnitQuaternion<S>) -> Vector3<S> {
     let (now, goal) = (now.to_rotation_matrix(), goal.to_rotation_matrix());
-    (0..3).map(|axis| now.matrix().column(axis).cross(&goal.matrix().column(axis))).sum::<Vector3<f64>>() * 0.5
+    (0..3).map(|axis| now.matrix().column(axis).cross(&goal.matrix().column(axis))).sum::<Vector3<S>>()
+        * convert::<f64, S>(0.5)
 }

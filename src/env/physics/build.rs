@@ -21,7 +21,8 @@ impl Physics {
         settings.num_internal_pgs_iterations = 4;
         // Contact springs scale with the mass at the contact; a cube of 64 g needs a stiff one.
         settings.contact_softness = SpringCoefficients::new(100.0, 5.0);
-        settings.static_contact_softness = settings.contact_softness;
+        // The table is a hundred times as stiff, so that an arm of many kilograms that comes down on a cube does not press it in.
+        settings.static_contact_softness = SpringCoefficients::new(1000.0, 5.0);
         // Distances of centimetres would count as contact for things of centimetres.
         settings.normalized_prediction_distance = 0.002;
         settings.normalized_allowed_linear_error = 0.000_1;
@@ -65,9 +66,10 @@ impl Physics {
         });
         let gripper = arm.gripper.clone();
         let mut pads = Vec::with_capacity(2);
+        let mut hand: Vec<ColliderHandle> = world.bodies[parent].colliders().to_vec();
         let fingers = SIDES.map(|side| {
             let body = world.insert_body(link_body(&gripper.inertia));
-            world.insert_collider(surface(placed(&gripper.on_side(&gripper.finger, side)), 1.0), Some(body));
+            hand.push(world.insert_collider(surface(placed(&gripper.on_side(&gripper.finger, side)), 1.0), Some(body)));
             pads.push(world.insert_collider(
                 surface(placed(&gripper.on_side(&gripper.pad, side)), gripper.pad_friction),
                 Some(body),
@@ -92,6 +94,7 @@ impl Physics {
             links,
             fingers,
             pads: [pads[0], pads[1]],
+            hand: hand.into_iter().chain(pads.iter().copied()).collect(),
             joints: handles.try_into().expect("seven hinges and two slides"),
             table,
             arm,

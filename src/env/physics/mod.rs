@@ -19,12 +19,14 @@
 
 mod build;
 mod convert;
+mod grip;
 mod step;
 
 use nalgebra::Vector3;
 use rapier3d::prelude::*;
 
 use self::convert::{from_rapier, from_vector};
+pub(crate) use self::step::dry_friction;
 use super::arm::{ArmDescription, JOINTS, JointVector, Pose};
 use super::kinematics::{KinematicModel, Kinematics};
 
@@ -84,6 +86,8 @@ pub struct Physics {
     links: [RigidBodyHandle; JOINTS],
     fingers: [RigidBodyHandle; 2],
     pads: [ColliderHandle; 2],
+    /// All shapes of the hand, pads included.
+    hand: Vec<ColliderHandle>,
     joints: [MultibodyJointHandle; JOINTS + 2],
     table: ColliderHandle,
 }
@@ -109,6 +113,7 @@ impl Clone for Physics {
             },
             arm: self.arm.clone(),
             model: self.model.clone(),
+            hand: self.hand.clone(),
             ..*self
         }
     }

@@ -1,15 +1,19 @@
 //! A physics step: motor torques, dry friction in the joints, and rapier's solver.
 
+use nalgebra::{RealField, convert};
 use rapier3d::math::Vector;
 use rapier3d::prelude::*;
 
 use super::{JointState, Physics, SIDES, TIMESTEP};
 use crate::env::arm::{GripperDescription, JOINTS, JointVector};
 
-/// Substeps of the solver in a physics step. A grasp needs more: the hand moves on arcs, a held
-/// object in straight lines from substep to substep, and the difference is slip.
+/// Substeps of the solver in a physics step, and where an object of a few grams is squeezed between an arm of many kilograms and
+/// something else: with such a ratio of masses, the solver's iterations find too small a force.
 const SUBSTEPS: usize = 1;
-const SUBSTEPS_HOLDING: usize = 6;
+const SUBSTEPS_SQUEEZED: usize = 12;
+
+/// A contact force that the weight of an object does not explain, N.
+const SQUEEZING: f64 = 3.0;
 
 /// A joint limit counts as near at this distance, far more than a joint moves in one step: rad, m.
 const HINGE_MARGIN: f64 = 0.1;
@@ -66,14 +70,43 @@ impl Physics {
             bodies[self.links[JOINTS - 1]].add_force_at_point(-push, at, true);
         }
         self.world.integration_parameters.num_solver_iterations =
-            if self.holding() { SUBSTEPS_HOLDING } else { SUBSTEPS };
+            if self.squeezes() { SUBSTEPS_SQUEEZED } else { SUBSTEPS };
+        let grip = self.grip();
         self.world.step();
+        if let Some(grip) = grip {
+            grip.carry(self);
+        }
     }
 
-    /// Whether a pad touches anything.
-    fn holding(&self) -> bool {
-        let mut pairs = self.pads.iter().flat_map(|&pad| self.world.narrow_phase.contact_pairs_with(pad));
-        pairs.any(|pair| pair.total_impulse_magnitude() > 0.0)
+    /// Whether the hand squeezes an object against something else: it presses in the same direction as the object does, or, by
+    /// friction, so hard that the object's weight cannot be the reason. (Across the table, a cube is pushed at right angles to the
+    /// direction in which it presses on the table.)
+    fn squeezes(&self) -> bool {
+        let PhysicsWorld { colliders, bodies, .. } = &self.world;
+        let normals = |one: ColliderHandle, pair: &ContactPair| -> Vec<Vector> {
+            let sign = if pair.collider1 == one { 1.0 } else { -1.0 };
+            let active = pair.manifolds().iter().filter(|manifold| !manifold.data.solver_contacts.is_empty());
+            active.map(|manifold| manifold.data.normal * sign).collect()
+        };
+        let movable = |shape: ColliderHandle| colliders[shape].parent().is_some_and(|body| bodies[body].is_dynamic());
+        self.hand.iter().any(|part| {
+            let mut objects = self.touched(*part).filter(|(other, _)| !self.hand.contains(other) && movable(*other));
+            objects.any(|(object, pair)| {
+                let towards = normals(*part, pair);
+                let mut others = self.touched(object).filter(|(other, _)| !self.hand.contains(other));
+                !towards.is_empty()
+                    && others.any(|(_, pair)| {
+                        f64::from(pair.total_impulse_magnitude()) > SQUEEZING * TIMESTEP
+                            || normals(object, pair).iter().any(|on| towards.iter().any(|by| on.dot(*by) > 0.1))
+                    })
+            })
+        })
+    }
+
+    /// The shapes near `shape`, each with the pair of the two.
+    pub(super) fn touched(&self, shape: ColliderHandle) -> impl Iterator<Item = (ColliderHandle, &ContactPair)> {
+        let pairs = self.world.narrow_phase.contact_pairs_with(shape);
+        pairs.map(move |pair| (if pair.collider1 == shape { pair.collider2 } else { pair.collider1 }, pair))
     }
 
     /// Tells the solver only of those joint limits that are near: each costs it a row in every
@@ -93,6 +126,6 @@ impl Physics {
 /// Dry friction (N m or N) that a joint feels which moves at `velocity` under `force`: just what would
 /// stop it within the step, up to `friction`. With rotor inertias this large it is as good as a row of
 /// the solver, and cheaper.
-fn dry_friction(friction: f64, armature: f64, velocity: f64, force: f64) -> f64 {
-    (armature * velocity / TIMESTEP + force).clamp(-friction, friction)
+pub(crate) fn dry_friction<S: RealField + Copy>(friction: S, armature: S, velocity: S, force: S) -> S {
+    (armature * velocity / convert(TIMESTEP) + force).clamp(-friction, friction)
 }

@@ -82,7 +82,7 @@ use crate::error::Result;
 use crate::rng;
 
 /// How far ahead of the hand a full action puts its goal, m.
-const MAX_LEAD: f64 = 0.05;
+pub(crate) const MAX_LEAD: f64 = 0.05;
 /// The same for a full rotation of the pose action, rad.
 const MAX_TURN: f64 = 0.5;
 
