@@ -64,6 +64,11 @@ fn percent(share: f64) -> String {
     format!("{:.0} %", 100.0 * share)
 }
 
+/// -3.14 as "-3.1".
+fn tenths(number: f64) -> String {
+    format!("{number:.1}")
+}
+
 fn save(panels: &Panels, path: &Path) -> Result<()> {
     files::write(path, panels.svg()?.as_bytes())
 }
