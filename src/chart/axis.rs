@@ -1,7 +1,7 @@
 //! What an axis can show: every number of a chart is checked here, and nowhere else.
 
 /// The largest size of a number in a chart. Between it and the largest of all numbers, plotters' arithmetic overflows.
-const LARGEST: f64 = 1e100;
+pub const LARGEST: f64 = 1e100;
 /// The narrowest range, as a share of its larger end: a narrower one has no room for different ticks.
 const NARROWEST: f64 = 1e-9;
 /// How far outside of the frame a point is drawn, in lengths of the axis. A dashed line to a point much farther away would

@@ -24,6 +24,7 @@ mod panels;
 use plotters::prelude::*;
 
 use crate::error::{Error, Result};
+pub use axis::LARGEST;
 use axis::{Axis, fits};
 use draw::Frame;
 pub use panels::Panels;

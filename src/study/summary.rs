@@ -36,7 +36,7 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
             ("sparc", "smoothness_sparc"),
             ("ldlj", "smoothness_ldlj"),
         ] {
-            let known = lists(&rows, column)?.concat();
+            let known: Vec<f64> = lists(&rows, column)?.concat().into_iter().filter(|x| x.is_finite()).collect();
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
         let (success, curves) = (lists(&rows, "success")?, curves(evaluations, &task, &method, "success")?);
@@ -48,6 +48,8 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
     let rows: Vec<Vec<(&str, Option<f64>)>> = all.iter().map(|runs| runs.row(&all)).collect();
     for name in SUMMARY {
         let entry = |row: &Vec<(&str, Option<f64>)>| row.iter().find(|(known, _)| *known == name).and_then(|(_, v)| *v);
+        // What cannot be computed from these numbers is an empty entry.
+        let entry = |row| entry(row).filter(|number: &f64| number.is_finite());
         columns.push(Column::new(name.into(), rows.iter().map(entry).collect::<Vec<Option<f64>>>()));
     }
     DataFrame::new_infer_height(columns)
