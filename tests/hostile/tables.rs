@@ -59,17 +59,60 @@ struct Study([Vec<u8>; 4]);
 
 #[derive(Clone, Debug)]
 enum Damage {
-    Cell { table: usize, row: Index, column: Index, text: String },
-    Header { table: usize, column: Index, text: String },
-    Column { table: usize, column: Index, text: String },
-    Double { table: usize, row: Index },
-    Drop { table: usize, row: Index },
-    Swap { table: usize, rows: [Index; 2] },
-    Shorten { table: usize, row: Index },
-    Lengthen { table: usize, row: Index },
-    Flip { table: usize, at: Index, bits: u8 },
-    Cut { table: usize, at: Index },
-    Empty { table: usize },
+    Cell {
+        table: usize,
+        row: Index,
+        column: Index,
+        text: String,
+    },
+    Header {
+        table: usize,
+        column: Index,
+        text: String,
+    },
+    Column {
+        table: usize,
+        column: Index,
+        text: String,
+    },
+    Double {
+        table: usize,
+        row: Index,
+    },
+    Drop {
+        table: usize,
+        row: Index,
+    },
+    Swap {
+        table: usize,
+        rows: [Index; 2],
+    },
+    Shorten {
+        table: usize,
+        row: Index,
+    },
+    Lengthen {
+        table: usize,
+        row: Index,
+    },
+    Flip {
+        table: usize,
+        at: Index,
+        bits: u8,
+    },
+    Cut {
+        table: usize,
+        at: Index,
+    },
+    Empty {
+        table: usize,
+    },
+    /// A task (column 0) or method (column 1) with another name everywhere.
+    Rename {
+        column: usize,
+        row: Index,
+        text: String,
+    },
 }
 
 fn damage() -> impl Strategy<Value = Damage> {
@@ -94,6 +137,8 @@ fn damage() -> impl Strategy<Value = Damage> {
         2 => (place.clone(), 1..=255_u8).prop_map(|((table, at), bits)| Damage::Flip { table, at, bits }),
         2 => place.prop_map(|(table, at)| Damage::Cut { table, at }),
         1 => table.prop_map(|table| Damage::Empty { table }),
+        4 => (0..2_usize, index(), select(&CELLS[..]))
+            .prop_map(|(column, row, text)| Damage::Rename { column, row, text: text.into() }),
     ]
 }
 
@@ -174,6 +219,22 @@ impl Study {
                 bytes.truncate(at.index(bytes.len() + 1));
             }
             Damage::Empty { table } => self.0[*table].clear(),
+            Damage::Rename { column, row: at, text } => {
+                let mut name = String::new();
+                let name_in = |line: &str| line.split(',').nth(*column).unwrap_or_default().to_string();
+                self.lines(3, |lines| name = name_in(&lines[row(lines, at)]));
+                for table in 0..TABLES.len() {
+                    self.lines(table, |lines| {
+                        for line in lines.iter_mut().filter(|line| name_in(line) == name) {
+                            let mut cells: Vec<&str> = line.split(',').collect();
+                            if let Some(cell) = cells.get_mut(*column) {
+                                *cell = text;
+                            }
+                            *line = cells.join(",");
+                        }
+                    });
+                }
+            }
         }
     }
 
