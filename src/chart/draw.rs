@@ -5,6 +5,7 @@ use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
+use super::axis::Axis;
 use super::{Chart, FONT, GREY, PALETTE, Series, Shape};
 use crate::error::{Error, Result};
 
@@ -50,7 +51,7 @@ impl Frame {
 }
 
 impl Chart {
-    pub(super) fn draw<X, Y>(&self, area: &Area, frame: &Frame, x: X, y: Y) -> Drawn
+    pub(super) fn draw<X, Y>(&self, area: &Area, frame: &Frame, axes: [Axis; 2], x: X, y: Y) -> Drawn
     where
         X: AsRangedCoord<Value = f64>,
         Y: AsRangedCoord<Value = f64>,
@@ -65,9 +66,8 @@ impl Chart {
             .margin(frame.margin)
             .margin_right(frame.margin_right)
             .x_label_area_size(frame.x_labels)
-            .y_label_area_size(frame.y_labels[usize::from(self.y_label.is_empty())])
+            .y_label_area_size(self.y_label_area(frame))
             .build_cartesian_2d(x, y)?;
-        let x_range = chart.x_range();
         chart
             .configure_mesh()
             .max_light_lines(0)
@@ -78,11 +78,14 @@ impl Chart {
             .x_labels(self.x_ticks.count)
             .y_labels(self.y_ticks.count)
             .x_label_formatter(&|x| (self.x_ticks.text)(*x))
-            .y_label_formatter(&|y| (self.y_ticks.text)(*y))
+            .y_label_formatter(&|y| {
+                self.rows.get(y.round() as usize).cloned().unwrap_or_else(|| (self.y_ticks.text)(*y))
+            })
             .label_style((FONT, 14))
             .draw()?;
+        let place = |(x, y): (f64, f64)| (axes[0].near(x), axes[1].near(y));
         if let Some(mark) = self.mark.filter(|mark| mark.is_finite()) {
-            let ends = [(x_range.start, mark), (x_range.end, mark)];
+            let ends = [axes[0].low, axes[0].high].map(|x| place((x, mark)));
             chart.draw_series(DashedLineSeries::new(ends, 7, 5, GREY.stroke_width(1)))?;
         }
         let mut colours = PALETTE.into_iter().cycle();
@@ -93,7 +96,7 @@ impl Chart {
             } else if *shape != Shape::Band {
                 colour = colours.next().expect("colours without end");
             }
-            let points: Vec<(f64, f64)> = points.iter().copied().filter(|point| self.shows(point)).collect();
+            let points: Vec<(f64, f64)> = points.iter().copied().filter(|point| self.shows(point)).map(place).collect();
             let line = colour.stroke_width(if *shape == Shape::Dashed { 2 } else { 3 });
             let series = match shape {
                 Shape::Line => chart.draw_series(LineSeries::new(points, line))?,
@@ -101,6 +104,7 @@ impl Chart {
                 Shape::Points => {
                     chart.draw_series(points.into_iter().map(|p| Circle::new(p, 3, colour.mix(0.7).filled())))?
                 }
+                Shape::Dots => chart.draw_series(points.into_iter().map(|p| Circle::new(p, 6, colour.filled())))?,
                 Shape::Band => chart.draw_series([Polygon::new(points, colour.mix(0.2))])?,
             };
             if !name.is_empty() {
@@ -110,7 +114,9 @@ impl Chart {
                     Shape::Dashed => {
                         series.legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 22, y)], 5, 3, line))
                     }
-                    Shape::Points => series.legend(move |(x, y)| Circle::new((x + 11, y), 3, line.filled())),
+                    Shape::Points | Shape::Dots => {
+                        series.legend(move |(x, y)| Circle::new((x + 11, y), 3, line.filled()))
+                    }
                     Shape::Line | Shape::Band => {
                         series.legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], line))
                     }
@@ -121,7 +127,7 @@ impl Chart {
         if names > 1 || (names == 1 && self.legend.is_some()) {
             chart
                 .configure_series_labels()
-                .position(self.legend.clone().unwrap_or_else(|| self.emptiest_corner()))
+                .position(self.legend.clone().unwrap_or_else(|| self.emptiest_corner(axes)))
                 .background_style(WHITE.mix(0.85))
                 .border_style(GREY.mix(0.4))
                 .label_font((FONT, 14))
@@ -130,61 +136,34 @@ impl Chart {
         Ok(())
     }
 
+    /// Wide enough for the labels of the y axis.
+    fn y_label_area(&self, frame: &Frame) -> u32 {
+        let longest = self.rows.iter().map(|name| name.chars().count()).max().unwrap_or(0) as u32;
+        frame.y_labels[usize::from(self.y_label.is_empty())].max(9 * longest.min(20) + 12)
+    }
+
     /// The corner in which the legend hides the fewest points.
-    fn emptiest_corner(&self) -> SeriesLabelPosition {
-        let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
-        let along = |value: f64, log: bool| if log { value.ln() } else { value };
-        let middle = |values: Vec<f64>| {
-            let (low, high) = (
-                values.iter().copied().fold(f64::INFINITY, f64::min),
-                values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-            );
-            (low + high) / 2.0
-        };
-        let x = middle(shown().map(|(x, _)| along(*x, self.x_log)).collect());
-        let y = match usable(self.y_range, self.y_log) {
-            Some((low, high)) => middle([low, high].map(|y| along(y, self.y_log)).to_vec()),
-            None => middle(shown().map(|(_, y)| along(*y, self.y_log)).collect()),
-        };
+    fn emptiest_corner(&self, [x, y]: [Axis; 2]) -> SeriesLabelPosition {
         let corners = [
             (SeriesLabelPosition::UpperRight, true, true),
             (SeriesLabelPosition::LowerRight, true, false),
             (SeriesLabelPosition::UpperLeft, false, true),
             (SeriesLabelPosition::LowerLeft, false, false),
         ];
+        let points = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
         let inside = |right: bool, up: bool| {
-            let here =
-                |&&(px, py): &&(f64, f64)| (along(px, self.x_log) > x) == right && (along(py, self.y_log) > y) == up;
-            shown().filter(here).count()
+            points().filter(|&&(px, py)| x.is_upper(px) == right && y.is_upper(py) == up).count()
         };
         let best = corners.into_iter().min_by_key(|(_, right, up)| inside(*right, *up));
         best.expect("four corners").0
     }
 }
 
-/// A range that was asked for, if an axis can have it.
-pub fn usable(range: Option<[f64; 2]>, log: bool) -> Option<(f64, f64)> {
-    let [low, high] = range?;
-    let fits = low.is_finite() && high.is_finite() && low != high && (!log || low.min(high) > 0.0);
-    fits.then_some((low, high))
-}
-
-/// The range of the numbers with a small margin, or `None` if there are none.
-pub fn span(numbers: impl Iterator<Item = f64>, log: bool) -> Option<(f64, f64)> {
-    let (low, high) =
-        numbers.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (f64::min(low, x), f64::max(high, x)));
-    if low > high {
-        return None;
-    }
-    if log {
-        return Some((low / 1.1, high * 1.1));
-    }
-    let margin = if high > low { 0.03 * (high - low) } else { high.abs().max(1.0) * 0.1 };
-    Some((low - margin, high + margin))
-}
-
-/// A number with up to four decimals, without trailing zeros.
+/// A number with up to four decimals, without trailing zeros; a very large one in powers of ten.
 pub fn plain(x: f64) -> String {
+    if x.abs() >= 1e9 {
+        return format!("{x:.2e}");
+    }
     let text = format!("{x:.4}");
     let text = text.trim_end_matches('0').trim_end_matches('.');
     if text == "-0" { "0".into() } else { text.into() }

@@ -1,6 +1,7 @@
 //! Charts as SVG: lines, points and bands in one frame ([`Chart`]), or frames side by side ([`Panels`]).
 //!
-//! In a notebook, either one is displayed if it is the last expression of a cell. Numbers that are not finite are left out.
+//! In a notebook, either one is displayed if it is the last expression of a cell. Numbers that no axis can show (not finite, or
+//! beyond 1e100) are left out.
 //!
 //! ```
 //! use handful::chart::{Chart, Panels};
@@ -16,13 +17,16 @@
 //! # Ok::<(), handful::error::Error>(())
 //! ```
 
+mod axis;
 mod draw;
 mod panels;
 
 use plotters::prelude::*;
 
 use crate::error::{Error, Result};
-use draw::{Frame, span, usable};
+pub use axis::LARGEST;
+use axis::{Axis, fits};
+use draw::Frame;
 pub use panels::Panels;
 
 /// Colours that colour-blind readers can tell apart (Okabe and Ito).
@@ -52,6 +56,7 @@ pub struct Chart {
     y_range: Option<[f64; 2]>,
     x_ticks: Ticks,
     y_ticks: Ticks,
+    rows: Vec<String>,
     mark: Option<f64>,
     legend: Option<SeriesLabelPosition>,
     series: Vec<Series>,
@@ -83,6 +88,7 @@ enum Shape {
     Line,
     Dashed,
     Points,
+    Dots,
     Band,
 }
 
@@ -134,6 +140,15 @@ impl Chart {
         self
     }
 
+    /// Writes names at the y axis instead of numbers, the first at the top: row `i` is at `y = i`.
+    pub fn rows<S: Into<String>>(mut self, names: impl IntoIterator<Item = S>) -> Self {
+        self.rows = names.into_iter().map(Into::into).collect();
+        // With one more than there are rows, plotters has room for all of them and for nothing between them.
+        self.y_ticks.count = self.rows.len() + 1;
+        let last = self.rows.len() as f64 - 1.0;
+        self.between(last + 0.6, -0.6)
+    }
+
     /// Adds a thin dashed line at this y across the frame: a reference value.
     pub fn mark(mut self, y: f64) -> Self {
         self.mark = Some(y);
@@ -160,6 +175,11 @@ impl Chart {
     /// Adds points, which are not connected.
     pub fn points(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Points, points.into_iter().collect())
+    }
+
+    /// Adds large dots, for a few values that matter each.
+    pub fn dots(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
+        self.with(name, Shape::Dots, points.into_iter().collect())
     }
 
     /// Sets the colour of the series added last; otherwise series take those of the [`PALETTE`] in turn.
@@ -196,24 +216,25 @@ impl Chart {
 
     /// Draws the chart on an area.
     fn draw_on(&self, area: &draw::Area, frame: &Frame) -> Result<()> {
-        let shown = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
-        let x = usable(self.x_range, self.x_log).or_else(|| span(shown().map(|(x, _)| *x), self.x_log));
-        let y = usable(self.y_range, self.y_log).or_else(|| span(shown().map(|(_, y)| *y), self.y_log));
-        let (Some((x0, x1)), Some((y0, y1))) = (x, y) else {
+        let points = || self.series.iter().flat_map(|series| &series.points).filter(|point| self.shows(point));
+        let x = Axis::new(self.x_range, points().map(|(x, _)| *x), self.x_log);
+        let y = Axis::new(self.y_range, points().map(|(_, y)| *y), self.y_log);
+        let (Some(x), Some(y)) = (x, y) else {
             return Err(Error::Config("chart: there is nothing to draw".into()));
         };
-        let drawn = match (self.x_log, self.y_log) {
-            (false, false) => self.draw(area, frame, x0..x1, y0..y1),
-            (true, false) => self.draw(area, frame, (x0..x1).log_scale(), y0..y1),
-            (false, true) => self.draw(area, frame, x0..x1, (y0..y1).log_scale()),
-            (true, true) => self.draw(area, frame, (x0..x1).log_scale(), (y0..y1).log_scale()),
+        let [across, up] = [x, y].map(|Axis { low, high, .. }| low..high);
+        let drawn = match (x.log, y.log) {
+            (false, false) => self.draw(area, frame, [x, y], across, up),
+            (true, false) => self.draw(area, frame, [x, y], across.log_scale(), up),
+            (false, true) => self.draw(area, frame, [x, y], across, up.log_scale()),
+            (true, true) => self.draw(area, frame, [x, y], across.log_scale(), up.log_scale()),
         };
         drawn.map_err(draw::failed)
     }
 
-    /// Only finite numbers enter a chart, and only positive ones a logarithmic scale.
+    /// Whether a point can be drawn on these axes.
     fn shows(&self, &(x, y): &(f64, f64)) -> bool {
-        x.is_finite() && y.is_finite() && (!self.x_log || x > 0.0) && (!self.y_log || y > 0.0)
+        fits(x, self.x_log) && fits(y, self.y_log)
     }
 
     /// Displays the chart in a notebook; called by the evcxr kernel.
@@ -243,6 +264,37 @@ mod tests {
             assert_eq!(chart.svg().expect("two points to draw"), own, "from {low} to {high}");
         }
         assert_eq!(Chart::new("x", "y").line("a", points).mark(f64::INFINITY).svg().expect("two points to draw"), own);
+    }
+
+    /// With every shape, also far outside of the frame. Most of these took plotters forever.
+    #[test]
+    fn no_number_hangs_a_chart() {
+        let hard = [0.0, 1.0, -1.0, 5e-324, 1e-200, 1e16, 1e16 + 2.0, 1e90, 1e300, f64::MAX, f64::INFINITY, f64::NAN];
+        for a in hard {
+            for b in hard {
+                let points = [(0.0, a), (a, b), (b, 2.0), (1.0, -b)];
+                let chart = Chart::new("x", "y").line("line", points).dashed("dashed", points).points("points", points);
+                let chart = chart.dots("dots", points).band([(0.0, a, b), (1.0, b, a), (b, 0.0, a)]).mark(b);
+                for chart in
+                    [chart.clone(), chart.clone().between(a, b), chart.clone().x_between(a, b).between(0.0, 1.0)]
+                {
+                    for chart in [chart.clone(), chart.clone().log_x(), chart.clone().log_y()] {
+                        let svg = chart.svg().unwrap_or_default();
+                        assert!(svg.len() < 500_000 && !svg.contains("NaN") && !svg.contains("inf"), "{a}, {b}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn rows_have_names() {
+        for count in 1..=30 {
+            let names: Vec<String> = (0..count).map(|i| format!("row {i};")).collect();
+            let chart = Chart::new("x", "").rows(&names).dots("", [(0.5, 0.0)]);
+            let svg = chart.svg().expect("a dot");
+            assert!(names.iter().all(|name| svg.matches(name.as_str()).count() == 1), "{count}");
+        }
     }
 
     #[test]

@@ -99,8 +99,8 @@ impl StudyObserver for Progress {
                 None
             }
             Event::Evaluated(row) => {
-                shown.success = Some(row.success);
-                let (percent, total) = (100.0 * row.success, row.return_mean);
+                shown.success = Some(row.summary.success);
+                let (percent, total) = (100.0 * row.summary.success, row.summary.return_mean);
                 Some(format!("{name}: {done}/{} steps, return {total:.1}, success {percent:.0} %", config.steps))
             }
             Event::Testing(episodes) => {

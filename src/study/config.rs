@@ -5,6 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use toml::{Table, Value};
 
+use super::names::check_name;
 use super::starts::{LIMIT, Starts, check_below};
 use crate::error::{Error, Result};
 
@@ -72,7 +73,7 @@ impl RunConfig {
         let mut table: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
         upgrade_keys(&mut table);
         let config = Self::from_table(table).map_err(|problem| bad_config(path, &problem))?;
-        config.check()?;
+        config.check().map_err(|problem| Error::Config(format!("{}: {problem}", path.display())))?;
         Ok(config)
     }
 
@@ -106,8 +107,11 @@ impl RunConfig {
     }
 
     /// # Errors
-    /// If a number lies outside its range.
+    /// If a name is not an identifier, or a number lies outside its range.
     pub(crate) fn check(&self) -> Result<()> {
+        for (what, name) in [("a task", &self.task), ("a method", &self.method), ("an agent", &self.agent)] {
+            check_name(what, name)?;
+        }
         check_below("seed", self.seed, LIMIT)?;
         // An evaluation has no more episodes than there are seeds for.
         for (name, value, limit) in [

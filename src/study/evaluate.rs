@@ -68,9 +68,11 @@ pub struct Summary {
     pub success: f64,
     /// Lower end of the 95 % Wilson interval of this one agent's success rate. Its episodes are independent of each other;
     /// those of agents trained with several seeds are not, and [`two_level_bootstrap`](super::statistics::two_level_bootstrap)
-    /// is for them.
+    /// is for them. Not a number in what earlier versions recorded during training.
+    #[serde(default = "unknown")]
     pub success_low: f64,
     /// Its upper end.
+    #[serde(default = "unknown")]
     pub success_high: f64,
     /// Mean return.
     pub return_mean: f64,
@@ -82,6 +84,10 @@ pub struct Summary {
     pub smoothness_ldlj: Option<f64>,
     /// Milliseconds to choose an action.
     pub action_ms: f64,
+}
+
+fn unknown() -> f64 {
+    f64::NAN
 }
 
 impl Evaluation {

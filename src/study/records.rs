@@ -45,29 +45,9 @@ pub struct EpisodeRow {
 pub struct EvaluationRow {
     /// Environment steps so far.
     pub step: usize,
-    /// Episodes.
-    pub episodes: usize,
-    /// Success rate.
-    pub success: f64,
-    /// Mean return.
-    pub return_mean: f64,
-    /// Standard deviation of the return.
-    pub return_std: f64,
-    /// Mean spectral arc length of the hand's speed.
-    pub smoothness_sparc: Option<f64>,
-    /// Mean log dimensionless jerk of the hand.
-    pub smoothness_ldlj: Option<f64>,
-    /// Milliseconds to choose an action.
-    pub action_ms: f64,
-}
-
-impl EvaluationRow {
-    pub(super) fn new(step: usize, summary: Summary) -> Self {
-        let Summary {
-            episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms, ..
-        } = summary;
-        Self { step, episodes, success, return_mean, return_std, smoothness_sparc, smoothness_ldlj, action_ms }
-    }
+    /// What was measured.
+    #[serde(flatten)]
+    pub summary: Summary,
 }
 
 /// A row of `losses.csv`: the mean of one loss over the last steps.
@@ -169,7 +149,12 @@ impl Progress {
             write_csv(&folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
         }
         write_csv(&folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
-        write_csv(&folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations.iter())?;
+        // Without the interval of the success rate, which follows from the rate and the episodes.
+        let evaluations = evaluations.iter().map(|EvaluationRow { step, summary: s }| {
+            let smoothness = (s.smoothness_sparc, s.smoothness_ldlj);
+            (step, s.episodes, s.success, s.return_mean, s.return_std, smoothness, s.action_ms)
+        });
+        write_csv(&folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations)?;
         write_csv(&folder.join("losses.csv"), &["step", "name", "value"], losses.iter())
     }
 }

@@ -18,8 +18,12 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     let tables = Tables::read(from)?;
     tables.write_summary(to)?;
     let pairs = tables.tasks_and_methods()?;
-    let mut tasks: Vec<&str> = pairs.iter().map(|(task, _)| task.as_str()).collect();
-    tasks.dedup();
+    let mut tasks: Vec<&str> = Vec::new();
+    for (task, _) in &pairs {
+        if !tasks.contains(&task.as_str()) {
+            tasks.push(task);
+        }
+    }
     let mut text = String::from("# Comparison\n\n");
     text += tuning_note(&tables)?;
     text += "Every number on this page comes from `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` in the same folder. ";
@@ -63,6 +67,12 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
                 write!(text, "\n![Value estimated by {method} on {task} over environment steps, and the return that followed]({file})\n")
                     .expect("text grows");
             }
+            match tables.left_out(task, method)? {
+                0 => {}
+                count => {
+                    text += &format!("\nNot drawn, because not finite: {count} of the numbers about `{method}`.\n");
+                }
+            }
         }
     }
     text += "\n## How certain is this?\n\n";
@@ -89,7 +99,11 @@ fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
     for (task, method) in tables.tasks_and_methods()? {
         let value = |column: &str| tables.value(&task, &method, column);
         let show = |column: &str, digits: usize| -> Result<String> {
-            Ok(value(column)?.map_or("-".into(), |v| format!("{v:.digits$}")))
+            Ok(match value(column)? {
+                None => "-".into(),
+                Some(v) if v.abs() >= 1e9 => format!("{v:.2e}"),
+                Some(v) => format!("{v:.digits$}"),
+            })
         };
         let percent =
             |column: &str| -> Result<String> { Ok(format!("{:.0}", 100.0 * value(column)?.unwrap_or(f64::NAN))) };

@@ -208,7 +208,7 @@ impl<E: Env> Run<E> {
     fn evaluate(&mut self) -> Result<Event> {
         let (step, episodes) = (self.progress.step, self.config.evaluation_episodes);
         let evaluation = self.evaluator.evaluate(&mut self.method, episodes, self.config.starts.curve())?;
-        let row = EvaluationRow::new(step, evaluation.summary());
+        let row = EvaluationRow { step, summary: evaluation.summary() };
         if let Some(agent) = self.method.as_learner() {
             let open_loop = agent.open_loop(&evaluation.episodes).into_iter();
             self.progress.model.extend(open_loop.map(|open_loop| ModelRow { step, open_loop }));
@@ -297,8 +297,19 @@ fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Optio
 #[cfg(test)]
 mod tests {
     use crate::model::open_loop::OpenLoop;
-    use crate::study::records::{LossRow, ModelRow};
+    use crate::study::records::{EvaluationRow, LossRow, ModelRow};
     use crate::study::registry::Registry;
+
+    /// Checkpoints of earlier versions keep no interval of an evaluation's success rate.
+    #[test]
+    fn evaluations_of_earlier_versions_are_read() {
+        let old = "step = 500\nepisodes = 20\nsuccess = 0.9\nreturn_mean = 86.9\nreturn_std = 4.6\naction_ms = 2.6\n";
+        let row: EvaluationRow = toml::from_str(old).expect("an old row");
+        assert_eq!((row.step, row.summary.episodes, row.summary.success), (500, 20, 0.9));
+        assert!(row.summary.smoothness_sparc.is_none() && row.summary.success_low.is_nan());
+        let again: EvaluationRow = toml::from_str(&toml::to_string(&row).expect("TOML")).expect("a row");
+        assert!(again.summary.success_high.is_nan() && again.summary.return_mean == 86.9);
+    }
 
     #[test]
     fn a_run_resumes_from_what_is_not_a_number() {

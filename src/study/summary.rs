@@ -36,7 +36,7 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
             ("sparc", "smoothness_sparc"),
             ("ldlj", "smoothness_ldlj"),
         ] {
-            let known = lists(&rows, column)?.concat();
+            let known: Vec<f64> = lists(&rows, column)?.concat().into_iter().filter(|x| x.is_finite()).collect();
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
         let (success, curves) = (lists(&rows, "success")?, curves(evaluations, &task, &method, "success")?);
@@ -47,7 +47,11 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
         vec![Column::new("task".into(), names(|r| &r.task)), Column::new("method".into(), names(|r| &r.method))];
     let rows: Vec<Vec<(&str, Option<f64>)>> = all.iter().map(|runs| runs.row(&all)).collect();
     for name in SUMMARY {
-        let entry = |row: &Vec<(&str, Option<f64>)>| row.iter().find(|(known, _)| *known == name).and_then(|(_, v)| *v);
+        // What cannot be computed from these numbers is an empty entry.
+        let entry = |row: &Vec<(&str, Option<f64>)>| {
+            let found = row.iter().find(|(known, _)| *known == name);
+            found.and_then(|(_, value)| *value).filter(|value| value.is_finite())
+        };
         columns.push(Column::new(name.into(), rows.iter().map(entry).collect::<Vec<Option<f64>>>()));
     }
     DataFrame::new_infer_height(columns)

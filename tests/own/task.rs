@@ -28,7 +28,7 @@ struct Touch {
 
 impl Touch {
     fn new(half: f64) -> Self {
-        Self { name: format!("touch {:.0} mm", 2000.0 * half), half, forgotten: 0, superfluous: 0 }
+        Self { name: format!("touch-{:.0}-mm", 2000.0 * half), half, forgotten: 0, superfluous: 0 }
     }
 
     fn way(&self, obs: &[f32]) -> Vector3<f64> {
@@ -107,7 +107,7 @@ fn its_script_solves_it() {
 fn its_spec_is_what_it_says() {
     let env = touch();
     let spec = env.spec();
-    assert_eq!((spec.name.as_str(), spec.horizon, spec.observation_size()), ("touch 50 mm", 60, 21));
+    assert_eq!((spec.name.as_str(), spec.horizon, spec.observation_size()), ("touch-50-mm", 60, 21));
     assert_eq!(spec.stages, ["near", "on a cube of 50 mm"]);
     assert!(spec.observation.iter().any(|feature| feature.cube.is_some()));
     let options = TableOptions { action: ActionKind::Pose, horizon: Some(7), ..TableOptions::default() };
@@ -166,11 +166,11 @@ fn what_does_not_fit_together_is_refused_when_it_is_made() {
         (
             Touch::new(0.025),
             robosuite,
-            "touch 50 mm: there is no robosuite observation of it (`TableTask::object_state`)",
+            "touch-50-mm: there is no robosuite observation of it (`TableTask::object_state`)",
         ),
-        (forgetful, TableOptions::default(), "touch 50 mm: `drawn` gives 0 bodies, objects and goal together are 1"),
-        (talkative, TableOptions::default(), "touch 50 mm: `observe` gives 17 numbers, `features` names 15"),
-        (Touch::new(0.025), never, "touch 50 mm: `horizon` must be at least 1"),
+        (forgetful, TableOptions::default(), "touch-50-mm: `drawn` gives 0 bodies, objects and goal together are 1"),
+        (talkative, TableOptions::default(), "touch-50-mm: `observe` gives 17 numbers, `features` names 15"),
+        (Touch::new(0.025), never, "touch-50-mm: `horizon` must be at least 1"),
     ] {
         let error = Tabletop::new(task, options).expect_err(expected);
         assert!(matches!(error, Error::Config(_)));

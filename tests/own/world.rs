@@ -88,6 +88,24 @@ fn what_is_missing_is_named() {
     assert!(refusal("pets").contains("learn_reward"), "{}", refusal("pets"));
 }
 
+/// Names become folders, figures and Markdown; one that cannot is told when it is used.
+#[test]
+fn names_are_identifiers() {
+    let registry = registry()
+        .env(EnvEntry::new("../puck", || Ok(Puck::default())))
+        .preset("<b>", "agent = \"sac\"\nsteps = 100\n");
+    for (task, method, what) in [("../puck", "sac", "a task"), ("puck", "<b>", "a method")] {
+        let problem = registry.config(task, method, 0, None, None).expect_err("not a name").to_string();
+        assert!(problem.contains(&format!("cannot be the name of {what}")), "{problem}");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("config.toml");
+    let config = "task = \"../../x\"\nmethod = \"sac\"\nseed = 0\nagent = \"sac\"\nsteps = 100\n";
+    std::fs::write(&path, config).expect("a writable folder");
+    let problem = handful::study::config::RunConfig::read(&path).expect_err("not a name").to_string();
+    assert!(problem.contains("config.toml") && problem.contains("`../../x` cannot be the name of a task"), "{problem}");
+}
+
 /// The puck, but after 230 steps its rewards are not numbers.
 struct Broken {
     puck: Puck,

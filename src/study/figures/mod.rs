@@ -4,6 +4,7 @@ use std::path::Path;
 
 use plotters::style::RGBColor;
 
+use super::statistics::mean;
 use super::tables::{Curve, Tables};
 use crate::chart::{GREY, PALETTE, Panels};
 use crate::error::Result;
@@ -38,16 +39,14 @@ type Band = Vec<(f64, [f64; 3])>;
 
 /// The band over the steps that all seeds have in common.
 fn band(curves: &[Curve]) -> Band {
-    let Some((steps, _)) = curves.iter().min_by_key(|(x, _)| x.len()) else {
-        return Vec::new();
-    };
-    let over_seeds = |(i, x): (usize, &f64)| {
-        let values: Vec<f64> = curves.iter().map(|(_, y)| y[i]).collect();
+    let at = |(x, y): &Curve, step: f64| x.iter().position(|other| *other == step).map(|i| y[i]);
+    let over_seeds = |step: f64| {
+        let values = curves.iter().map(|curve| at(curve, step)).collect::<Option<Vec<f64>>>()?;
         let low = values.iter().copied().fold(f64::INFINITY, f64::min);
         let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        (*x, [low, values.iter().sum::<f64>() / values.len() as f64, high])
+        Some((step, [low, mean(&values), high]))
     };
-    steps.iter().enumerate().map(over_seeds).collect()
+    curves.first().map_or(Vec::new(), |(steps, _)| steps.iter().filter_map(|step| over_seeds(*step)).collect())
 }
 
 fn means(band: &Band) -> impl Iterator<Item = (f64, f64)> {
@@ -62,6 +61,11 @@ fn thousands(x: f64) -> String {
 /// 0.25 as "25 %".
 fn percent(share: f64) -> String {
     format!("{:.0} %", 100.0 * share)
+}
+
+/// -3.14 as "-3.1".
+fn tenths(number: f64) -> String {
+    format!("{number:.1}")
 }
 
 fn save(panels: &Panels, path: &Path) -> Result<()> {

@@ -3,7 +3,7 @@ use std::path::Path;
 use plotters::chart::SeriesLabelPosition;
 use plotters::style::RGBColor;
 
-use super::{Band, Tables, band, means, percent, save, thousands};
+use super::{Band, Tables, band, means, percent, save, tenths, thousands};
 use crate::chart::{Chart, PALETTE, Panels};
 use crate::error::Result;
 
@@ -82,10 +82,6 @@ fn over_training(title: &str, lines: &[(RGBColor, String, Band)]) -> Chart {
         .x_ticks(5, thousands)
         .legend(SeriesLabelPosition::LowerRight);
     lines.iter().fold(chart, |chart, (colour, label, band)| chart.line(label, means(band)).coloured(*colour))
-}
-
-fn tenths(y: f64) -> String {
-    format!("{y:.1}")
 }
 
 fn whole(y: f64) -> String {

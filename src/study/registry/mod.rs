@@ -38,7 +38,8 @@ use crate::env::Env;
 use crate::error::{Error, Result};
 use crate::rng;
 
-/// Environments, agents and presets by name.
+/// Environments, agents and presets by name. A name has up to 64 letters (A to Z), digits, and `-` or `_` between them: it
+/// becomes a folder and a part of reports. Another one is refused by [`Registry::config`].
 pub struct Registry {
     envs: Vec<ErasedEnv>,
     agents: Vec<AgentEntry>,

@@ -2,15 +2,20 @@
 //! Everything else (`summary.csv` with one row per task and method, the figures, the report) is computed from these files
 //! alone.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use polars::prelude::*;
 
+mod read;
+
 use super::config::RunConfig;
 use super::starts::Starts;
 use super::summary::summarise;
+use crate::chart::LARGEST;
 use crate::error::{Error, Result};
 use crate::files;
+use read::Layout;
 
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
@@ -47,10 +52,16 @@ impl Tables {
     pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
         let (mut evaluations, mut tests) = (Vec::new(), Vec::new());
         let (mut models, mut values) = (Vec::new(), Vec::new());
+        let mut seen = BTreeSet::new();
         for folder in folders {
             let config = RunConfig::read(&folder.join("config.toml"))?;
-            let labelled = |file: &str| -> Result<LazyFrame> {
-                let frame = read(&folder.join(file))?.lazy();
+            if !seen.insert((config.task.clone(), config.method.clone(), config.seed, config.starts.name())) {
+                let problem =
+                    format!("`{}` on `{}` with seed {} is there twice", config.method, config.task, config.seed);
+                return Err(Error::data(folder)(problem));
+            }
+            let labelled = |file: &str, layout: &Layout| -> Result<LazyFrame> {
+                let frame = read::of_run(&folder.join(file), layout)?.lazy();
                 Ok(frame.select([
                     lit(config.task.as_str()).alias("task"),
                     lit(config.method.as_str()).alias("method"),
@@ -58,13 +69,15 @@ impl Tables {
                     all().as_expr(),
                 ]))
             };
-            tests.push(labelled("test.csv")?.with_column(lit(config.starts.name()).alias("starts")));
+            tests.push(labelled("test.csv", &read::TESTS)?.with_column(lit(config.starts.name()).alias("starts")));
             if config.learns() {
-                evaluations.push(labelled("evaluations.csv")?);
+                evaluations.push(labelled("evaluations.csv", &read::EVALUATIONS)?);
             }
-            for (file, frames) in [("model.csv", &mut models), ("values.csv", &mut values)] {
+            for (file, layout, frames) in
+                [("model.csv", &read::MODELS, &mut models), ("values.csv", &read::VALUES, &mut values)]
+            {
                 if folder.join(file).exists() {
-                    frames.push(labelled(file)?);
+                    frames.push(labelled(file, layout)?);
                 }
             }
         }
@@ -82,12 +95,16 @@ impl Tables {
     /// # Errors
     /// If one is missing or damaged, or the starts of the tests differ.
     pub fn read(folder: &Path) -> Result<Self> {
-        let [evaluations, models, values, tests] =
-            ["evaluations.csv", "models.csv", "values.csv", "tests.csv"].map(|name| read(&folder.join(name)));
-        Self::summarised([evaluations?, models?, values?, tests?])
+        Self::summarised([
+            read::of_study(&folder.join("evaluations.csv"), &read::EVALUATIONS)?,
+            read::of_study(&folder.join("models.csv"), &read::MODELS)?,
+            read::of_study(&folder.join("values.csv"), &read::VALUES)?,
+            read::of_study(&folder.join("tests.csv"), &read::TESTS)?,
+        ])
     }
 
     fn summarised([evaluations, models, values, tests]: [DataFrame; 4]) -> Result<Self> {
+        check_runs(&evaluations, [&models, &values], &tests)?;
         let summary = summarise(&evaluations, &tests).map_err(inside)?;
         let tables = Self { evaluations, models, values, tests, summary };
         tables.starts()?;
@@ -181,6 +198,24 @@ impl Tables {
         curves(&self.values, task, method, column).map_err(inside)
     }
 
+    /// How many numbers of a method's model and values its figures leave out, because they are not finite or too large.
+    ///
+    /// # Errors
+    /// If a table lacks a column.
+    pub fn left_out(&self, task: &str, method: &str) -> Result<usize> {
+        let mut count = 0;
+        for (table, columns) in
+            [(&self.models, &["rmse", "coverage90"][..]), (&self.values, &["expected", "realised", "correlation"])]
+        {
+            let rows = of(table, task, method).map_err(inside)?;
+            for column in columns.iter().filter(|_| rows.width() > 0) {
+                let drawn = |number: &f64| number.abs() <= LARGEST;
+                count += numbers(&rows, column).map_err(inside)?.iter().flatten().filter(|x| !drawn(x)).count();
+            }
+        }
+        Ok(count)
+    }
+
     /// An entry of the summary; `None` if the entry is empty.
     ///
     /// # Errors
@@ -208,12 +243,14 @@ pub(super) fn by_run(rows: LazyFrame, columns: &[&str]) -> PolarsResult<DataFram
     rows.group_by_stable(["task", "method", "seed"].map(col)).agg(lists).collect()
 }
 
-/// A column over environment steps, for each seed.
+/// A column over environment steps, for each seed. What no chart can show is left out.
 pub(super) fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
     if rows.width() == 0 {
         return Ok(Vec::new());
     }
-    let known = of(rows, task, method)?.lazy().filter(col(value).is_not_null());
+    let number = col(value).cast(DataType::Float64);
+    let shown = number.clone().gt_eq(lit(-LARGEST)).and(number.lt_eq(lit(LARGEST)));
+    let known = of(rows, task, method)?.lazy().filter(shown);
     let runs = by_run(known, &["step", value])?;
     Ok(lists(&runs, "step")?.into_iter().zip(lists(&runs, value)?).collect())
 }
@@ -232,21 +269,6 @@ fn numbers(frame: &DataFrame, column: &str) -> PolarsResult<Vec<Option<f64>>> {
     Ok(column.f64()?.iter().collect())
 }
 
-fn read(path: &Path) -> Result<DataFrame> {
-    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
-    if bytes.is_empty() {
-        return Ok(DataFrame::empty());
-    }
-    let reader = CsvReadOptions::default().with_infer_schema_length(None);
-    let reader = reader.into_reader_with_file_handle(std::io::Cursor::new(bytes));
-    let foreign = |problem: PolarsError| Error::Data {
-        path: path.into(),
-        problem: format!("not a table of a study ({problem})"),
-        source: Some(problem.into()),
-    };
-    reader.finish().map_err(foreign)
-}
-
 fn write(path: &Path, table: &DataFrame) -> Result<()> {
     let mut bytes = Vec::new();
     if table.width() > 0 {
@@ -255,7 +277,46 @@ fn write(path: &Path, table: &DataFrame) -> Result<()> {
     files::write(path, &bytes)
 }
 
-/// An error in a table that could be read: it was edited by hand, or comes from another version.
+/// Every run was tested, and of a method that learns every run was evaluated.
+fn check_runs(evaluations: &DataFrame, others: [&DataFrame; 2], tests: &DataFrame) -> Result<()> {
+    let [evaluated, tested] = [evaluations, tests].map(|table| runs(table).map_err(inside));
+    let (evaluated, tested) = (evaluated?, tested?);
+    if tested.is_empty() {
+        return Err(Error::Config("the study has no test episode: there is nothing to report".into()));
+    }
+    let missing = |run: &(String, String, String), table: &str| {
+        let (task, method, seed) = run;
+        Err(Error::Config(format!(
+            "the study is incomplete: `{method}` on `{task}` with seed {seed} is not in its {table}"
+        )))
+    };
+    for table in [evaluations, others[0], others[1]] {
+        if let Some(run) = runs(table).map_err(inside)?.difference(&tested).next() {
+            return missing(run, "tests");
+        }
+    }
+    let learns = |(task, method, _): &&(String, String, String)| {
+        evaluated.iter().any(|(of, other, _)| (of, other) == (task, method))
+    };
+    match tested.difference(&evaluated).find(learns) {
+        Some(run) => missing(run, "evaluations"),
+        None => Ok(()),
+    }
+}
+
+/// Task, method and seed of each run in a table.
+fn runs(table: &DataFrame) -> PolarsResult<BTreeSet<(String, String, String)>> {
+    if table.width() == 0 {
+        return Ok(BTreeSet::new());
+    }
+    let seeds = table.column("seed")?.cast(&DataType::String)?;
+    let seeds = seeds.str()?.iter().map(|seed| seed.unwrap_or_default().to_string());
+    let names = strings(table, "task")?.into_iter().zip(strings(table, "method")?);
+    Ok(names.zip(seeds).map(|((task, method), seed)| (task, method, seed)).collect())
+}
+
+/// An error in tables that could be read.
 fn inside(problem: PolarsError) -> Error {
-    Error::Config(format!("the tables of the study are inconsistent: {problem}"))
+    let problem = problem.to_string();
+    Error::Config(format!("the tables of the study are inconsistent: {}", problem.lines().next().unwrap_or_default()))
 }
