@@ -134,7 +134,8 @@ macro_rules! ranges {
                 use $crate::settings::{Any, Nested, Rule, below};
                 let Self { $($field,)+ } = self;
                 $(Rule::check(&($rule), &below(path, stringify!($field)), $field)?;)+
-                $(if !$condition {
+                $(let holds = $condition;
+                if !holds {
                     return Err($crate::error::Error::Config(format!("`{path}`: {}", $says)));
                 })*
                 Ok(())

@@ -399,11 +399,14 @@ fn mutations() -> impl Strategy<Value = Vec<Mutation>> {
     prop::collection::vec(mutation, 1..3)
 }
 
-fn hostile_values() -> Vec<Value> {
-    let floats =
-        [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e300, -1e300, 1e-300, -1.0, 0.0, 0.1, 0.5, 1.0, 2.0, 1e3, 1e30];
+/// What takes the place of a value: most of the time one of its kind.
+fn hostile_values(like: &Value) -> Vec<Value> {
+    let wild = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e300, -1e300, 1e-300, -1.0, 1e30];
+    let bounds = [0.0, 1e-6, 1e-4, 1e-3, 0.1, 0.5, 0.9, 1.0, 2.0, 10.0, 100.0, 1e3, 1e4, 1e6];
     let whole = [-1, 0, 1, 2, 3, 4, 5, 6, i64::MAX, i64::MIN, 1 << 32, 1_000_000_000];
-    let numbers = floats.into_iter().map(Value::Float).chain(whole.into_iter().map(Value::Integer));
+    let floats = wild.into_iter().chain(bounds).map(Value::Float);
+    let numbers: Vec<Value> = floats.chain(whole.into_iter().map(Value::Integer)).collect();
+    let of_its_kind = numbers.iter().filter(|number| number.same_type(like)).cloned().cycle();
     let others = [
         Value::String("text".into()),
         Value::String("long ".repeat(10_000)),
@@ -416,7 +419,8 @@ fn hostile_values() -> Vec<Value> {
         "cvar = nan".parse::<Table>().expect("a risk").into(),
         Value::Datetime("1979-05-27".parse().expect("a date")),
     ];
-    numbers.chain(others).collect()
+    let others = numbers.iter().cloned().chain(others);
+    of_its_kind.take(100).chain(others).collect()
 }
 
 /// The text of the file, and whether it holds anything that must be refused.
@@ -426,9 +430,9 @@ fn mutated(mut table: Table, mutations: &[Mutation]) -> (String, bool) {
         let paths = paths(&table);
         match mutation {
             Mutation::Replace(path, value) => {
-                let value = value.get(&hostile_values()).clone();
                 let path: &Vec<String> = path.get(&paths);
-                *at(&mut table, path) = value;
+                let place = at(&mut table, path);
+                *place = value.get(&hostile_values(place)).clone();
             }
             Mutation::Remove(path) => {
                 let path = path.get(&paths);
