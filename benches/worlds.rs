@@ -18,7 +18,7 @@ fn random_actions(size: usize, count: usize) -> Vec<Vec<f32>> {
 }
 
 fn endless(task: Task, action: ActionKind) -> World {
-    let options = TableOptions { action, horizon: Some(usize::MAX), ..TableOptions::default() };
+    let options = TableOptions { action, horizon: Some(10_000), ..TableOptions::default() };
     task.make_with(options).expect("an arm task")
 }
 

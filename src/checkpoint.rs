@@ -75,6 +75,12 @@ impl Weights {
         found.ok_or_else(|| Error::Config(format!("the weights have no `{name}`")))
     }
 
+    /// The name of an array that holds NaN, if there is one.
+    pub fn with_nan(&self) -> Option<&str> {
+        let found = self.arrays.iter().find(|(_, (numbers, _))| numbers.iter().any(|x| x.is_nan()));
+        found.map(|(name, _)| name.as_str())
+    }
+
     /// Adds whole numbers, stored as a U64 tensor.
     pub fn insert_counts(&mut self, name: impl Into<String>, counts: &[u64]) {
         self.counts.insert(name.into(), counts.to_vec());

@@ -91,6 +91,14 @@ pub enum Error {
         /// What the system said.
         source: std::io::Error,
     },
+    /// Training that ended in NaN: what was saved before is still there.
+    #[error("{what} is NaN at step {step}: training has diverged; try smaller learning rates")]
+    Diverged {
+        /// The loss, or the array of weights.
+        what: String,
+        /// Environment steps so far.
+        step: usize,
+    },
     /// Ctrl-C: the run was saved and can be resumed.
     #[error("interrupted; the same command resumes it")]
     Interrupted,
@@ -104,7 +112,9 @@ impl Error {
     /// An unknown name, with the closest of the `known` ones.
     pub fn unknown<'a>(what: &'static str, name: &str, known: impl IntoIterator<Item = &'a str>) -> Self {
         let known: Vec<String> = known.into_iter().map(String::from).collect();
-        Self::UnknownName { what, name: name.into(), closest: closest(name, &known), known }
+        // No name of ours is that long, and the distance would take its length in time.
+        let closest = if name.len() > MAX_NAME { None } else { closest(name, &known) };
+        Self::UnknownName { what, name: shortened(name, MAX_NAME), closest, known }
     }
 
     /// An action that does not fit.
@@ -130,6 +140,18 @@ impl Error {
     pub fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_path_buf();
         move |source| Self::Io { doing, path, source }
+    }
+}
+
+/// Characters of a name that a message repeats.
+const MAX_NAME: usize = 60;
+
+/// Text from outside as part of a message: on one line, and no longer than `limit` characters.
+pub(crate) fn shortened(text: &str, limit: usize) -> String {
+    let line = |text: &str| text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    match text.char_indices().nth(limit) {
+        None => line(text),
+        Some((end, _)) => line(&text[..end]) + "...",
     }
 }
 

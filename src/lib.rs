@@ -82,7 +82,7 @@
 //! | 1 | [`replay`] | transitions, episodes, replay buffers |
 //! | 0 | [`env`](mod@env) | environments: the arm at its table, pendulum, cart-pole |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
-//! | 0 | [`checkpoint`], [`rng`], [`files`], [`error`] | weights in files, random numbers, files that are written whole, errors |
+//! | 0 | [`checkpoint`], [`rng`], [`files`], [`settings`], [`error`] | weights in files, random numbers, files that are written whole, ranges of settings, errors |
 //! | 0 | `chart` | charts for chapters, examples and reports (feature `figures`) |
 //!
 //! What holds everywhere:
@@ -109,6 +109,7 @@ pub mod nn;
 pub mod plan;
 pub mod replay;
 pub mod rng;
+pub mod settings;
 pub mod study;
 pub mod watch;
 

@@ -57,7 +57,7 @@ fn bad_input_is_refused_in_one_line() {
     std::fs::write(here.join("kind.toml"), "[sac]\nbatch = \"many\"\n").expect("a writable folder");
     check(train(&["--config", "kind.toml"]), &["kind.toml", "many"]);
     std::fs::write(here.join("zero.toml"), "[sac]\nbatch = 0\n").expect("a writable folder");
-    check(train(&["--config", "zero.toml"]), &["`batch` must be at least 1"]);
+    check(train(&["--config", "zero.toml"]), &["`sac.batch` is 0", "1..=65536"]);
     std::fs::write(here.join("broken.toml"), "[sac\n").expect("a writable folder");
     check(train(&["--config", "broken.toml"]), &["broken.toml"]);
     check(train(&["--config", "missing.toml"]), &["cannot read missing.toml"]);

@@ -37,7 +37,7 @@ pub use baselines::{Random, Scripted};
 pub use dreamer::{Dreamer, DreamerConfig};
 pub use oracle::{Oracle, OracleConfig};
 pub use pets::{Pets, PetsConfig};
-pub(crate) use presets::{PRESETS, merge, preset_table, specialise};
+pub(crate) use presets::{PRESETS, preset_table, specialise};
 pub use presets::{Preset, method_names};
 pub use sac::{Sac, SacConfig};
 pub use slots::{Slot, Slots};

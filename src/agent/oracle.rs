@@ -13,6 +13,7 @@ use crate::env::{Env, Snapshot};
 use crate::error::{Error, Result};
 use crate::plan::{ActionSequences, ControlConfig, IcemConfig, MakePlanner, PlannerConfig, RecedingHorizon};
 use crate::rng::{self, Rng};
+use crate::settings::{Ranges, fits, ranges};
 
 /// Settings of [`Oracle`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,6 +36,12 @@ impl Default for OracleConfig {
         }
     }
 }
+
+ranges!(OracleConfig { planner: Nested, control: Nested, terminal_weight: 0.0..=1e6, }
+require control.suits(planner) => "`control.replan_every` must not exceed the planner's `horizon`";
+require fits(&[planner.candidates(), planner.horizon(), control.action_repeat]) =>
+    "the planner's candidates times `horizon` times `control.action_repeat` do not fit into memory";
+);
 
 /// Receding-horizon control with the true environment as the model, in any environment that can be restored.
 ///
@@ -64,7 +71,7 @@ impl<E: Env + Snapshot> Oracle<E> {
     /// # Errors
     /// If a setting cannot be used, or what `make` answers.
     pub fn new(make: impl Fn() -> Result<E>, config: OracleConfig, seed: u64) -> Result<Self> {
-        config.control.check(&config.planner)?;
+        config.check_at("oracle")?;
         let simulators = (0..rayon::current_num_threads()).map(|_| make()).collect::<Result<Vec<_>>>()?;
         simulators[0].spec().check()?;
         Ok(Self {

@@ -7,6 +7,7 @@ use toml::{Table, Value};
 
 use super::{DreamerConfig, OracleConfig, PetsConfig, SacConfig};
 use crate::error::{Error, Result};
+use crate::settings::{choices, merge};
 
 /// Each preset's name and text.
 pub(crate) const PRESETS: [(&str, &str); 9] = [
@@ -53,7 +54,7 @@ pub trait Preset: DeserializeOwned + Default {
     /// # Errors
     /// As [`Preset::preset`].
     fn preset_for(method: &str, task: &str) -> Result<Self> {
-        let mut table = preset_table(&PRESETS, task, method)?;
+        let mut table = preset_table(&PRESETS, task, method, &choices::<Self>(Self::TABLE))?;
         if table.get("agent").and_then(Value::as_str) != Some(Self::TABLE) {
             return Err(Error::Config(format!("the method `{method}` has no settings of the kind `{}`", Self::TABLE)));
         }
@@ -78,37 +79,48 @@ impl Preset for OracleConfig {
     const TABLE: &'static str = "oracle";
 }
 
-/// The settings of a method for a task: its preset's, over those of the preset that it names as its `base`.
-pub(crate) fn preset_table(presets: &[(impl AsRef<str>, impl AsRef<str>)], task: &str, method: &str) -> Result<Table> {
-    let found = presets.iter().find(|(name, _)| name.as_ref() == method);
-    let (_, text) =
-        found.ok_or_else(|| Error::unknown("method", method, presets.iter().map(|(name, _)| name.as_ref())))?;
-    let mut table: Table = toml::from_str(text.as_ref())
-        .map_err(|problem| Error::Config(format!("the preset `{method}`: {}", problem.message())))?;
-    specialise(&mut table, task);
-    let Some(Value::String(base)) = table.remove("base") else { return Ok(table) };
-    let mut whole = preset_table(presets, task, &base)?;
-    merge(&mut whole, table);
+/// The settings of a method for a task: its preset's, over those of the preset that it names as its `base`. `choices` are the
+/// paths of tables that name a variant ([`merge`]).
+pub(crate) fn preset_table(
+    presets: &[(impl AsRef<str>, impl AsRef<str>)],
+    task: &str,
+    method: &str,
+    choices: &[String],
+) -> Result<Table> {
+    let mut tables = Vec::new();
+    let mut next = Some(method.to_string());
+    while let Some(name) = next {
+        let wrong = |problem: &str| Error::Config(format!("the preset `{name}`: {problem}"));
+        if tables.len() == presets.len() {
+            return Err(wrong("it is its own `base`"));
+        }
+        let found = presets.iter().find(|(other, _)| other.as_ref() == name);
+        let (_, text) =
+            found.ok_or_else(|| Error::unknown("method", &name, presets.iter().map(|(name, _)| name.as_ref())))?;
+        let mut table: Table = toml::from_str(text.as_ref()).map_err(|problem| wrong(problem.message()))?;
+        specialise(&mut table, task, choices).map_err(|problem| wrong(&problem.to_string()))?;
+        next = match table.remove("base") {
+            None => None,
+            Some(Value::String(base)) => Some(base),
+            Some(_) => return Err(wrong("`base` must be the name of a preset")),
+        };
+        tables.push(table);
+    }
+    let mut whole = Table::new();
+    tables.into_iter().rev().for_each(|table| merge(&mut whole, table, choices));
     Ok(whole)
 }
 
 /// Puts the part of a table that is for this task over the rest of it.
-pub(crate) fn specialise(table: &mut Table, task: &str) {
-    if let Some(Value::Table(mut by_task)) = table.remove("for")
-        && let Some(Value::Table(part)) = by_task.remove(task)
-    {
-        merge(table, part);
+///
+/// # Errors
+/// If `for` is not a table with a table for each task.
+pub(crate) fn specialise(table: &mut Table, task: &str, choices: &[String]) -> Result<()> {
+    let Some(by_task) = table.remove("for") else { return Ok(()) };
+    let mut by_task: std::collections::BTreeMap<String, Table> =
+        by_task.try_into().map_err(|_| Error::Config("`for` must hold a table for each task: `[for.TASK]`".into()))?;
+    if let Some(part) = by_task.remove(task) {
+        merge(table, part, choices);
     }
-}
-
-/// Puts `over` over `base`, table by table.
-pub(crate) fn merge(base: &mut Table, over: Table) {
-    for (key, value) in over {
-        match (base.get_mut(&key), value) {
-            (Some(Value::Table(base)), Value::Table(over)) => merge(base, over),
-            (_, value) => {
-                base.insert(key, value);
-            }
-        }
-    }
+    Ok(())
 }

@@ -29,6 +29,7 @@
 pub mod arm;
 pub mod cartpole;
 pub mod contract;
+mod inertia;
 pub mod kinematics;
 pub mod osc;
 pub mod pendulum;

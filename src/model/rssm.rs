@@ -32,11 +32,11 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
 use crate::nn::norm::RmsNorm;
 use crate::nn::recurrent::gru;
 use crate::nn::{BlockDense, Categorical, Grad, Mlp, TapeOps, Tensor3, ops, parameters_of_fields, tensor, values};
 use crate::rng::Rng;
+use crate::settings::{fits, ranges};
 
 /// Sizes of an [`Rssm`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -64,24 +64,20 @@ impl Default for RssmConfig {
     }
 }
 
-impl RssmConfig {
-    /// # Errors
-    /// If the sizes do not fit together.
-    pub(crate) fn check(&self) -> Result<()> {
-        if self.blocks == 0 || !self.deter.is_multiple_of(self.blocks) || self.deter == 0 {
-            return Err(Error::Config(format!(
-                "rssm: `deter` ({}) must be a multiple of `blocks` ({})",
-                self.deter, self.blocks
-            )));
-        }
-        if self.hidden == 0 || self.stoch == 0 || self.classes < 2 || !(0.0..1.0).contains(&self.unimix) {
-            return Err(Error::Config(
-                "rssm: `hidden` and `stoch` must be at least 1, `classes` at least 2, `unimix` in [0, 1)".into(),
-            ));
-        }
-        Ok(())
-    }
+ranges!(RssmConfig {
+    deter: 1..=16_384,
+    blocks: 1..=16_384,
+    hidden: 1..=4096,
+    stoch: 1..=1024,
+    classes: 2..=1024,
+    unimix: 0.0..=0.999,
+}
+require deter.is_multiple_of(*blocks) => "`deter` must be a multiple of `blocks`";
+require fits(&[3, *deter, deter / blocks]) => "`deter` times `deter / blocks` are too many weights";
+require fits(&[*hidden, 3 * deter + stoch * classes]) => "`hidden` times the numbers of a latent state are too many weights";
+);
 
+impl RssmConfig {
     /// Numbers in the stochastic state, `stoch x classes`.
     pub fn stoch_size(&self) -> usize {
         self.stoch * self.classes

@@ -21,6 +21,8 @@ use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
+use crate::settings::ranges;
+
 /// Decomposes the members' predictions (means and variances, `[members][features]`) into mean, aleatoric variance (the mean
 /// of the variances) and epistemic variance (the variance of the means), `[features]` each. The sum of the two is the
 /// variance of the mixture (law of total variance).
@@ -112,6 +114,13 @@ pub enum Risk {
     #[doc(alias = "exponential utility")]
     Entropic(f32),
 }
+
+ranges!(enum Risk {
+    Neutral,
+    "mean-std" MeanStd: -1e6..=1e6,
+    "cvar" Cvar: 0.0..=1.0,
+    "entropic" Entropic: 1e-4..=1e3,
+});
 
 impl Risk {
     /// The score of these returns.

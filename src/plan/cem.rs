@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::{self, Rng};
+use crate::settings::ranges;
 
 /// Variance of the search distribution at the start of every plan: (upper - lower)^2 / 16.
 const START_VARIANCE: f64 = 0.25;
@@ -35,6 +36,16 @@ impl Default for CemConfig {
         Self { horizon: 25, population: 400, elites: 40, iterations: 5, momentum: 0.1 }
     }
 }
+
+ranges!(CemConfig {
+    horizon: 2..=1000,
+    population: 1..=1_000_000,
+    elites: 1..=1_000_000,
+    iterations: 1..=10_000,
+    momentum: 0.0..=1.0,
+}
+require elites <= population => "`elites` must not exceed `population`";
+);
 
 /// The cross-entropy method, the planner of PETS. It executes the mean of its last distribution rather than the best
 /// sample, whose return may be an outlier of the model's noise.

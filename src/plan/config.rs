@@ -6,7 +6,7 @@ use super::{
     Cem, CemConfig, Gradient, GradientConfig, Hybrid, HybridConfig, Icem, IcemConfig, MakePlanner, Mppi, MppiConfig,
     Planner, RandomShooting, ShootingConfig,
 };
-use crate::error::{Error, Result};
+use crate::settings::ranges;
 
 /// A planner of this crate with its settings.
 ///
@@ -59,26 +59,28 @@ impl PlannerConfig {
         }
     }
 
-    /// # Errors
-    /// If the horizon is shorter than two time steps, or there would be no candidates.
-    pub(crate) fn check(&self) -> Result<()> {
-        let candidates = match self {
+    /// Candidates that are evaluated side by side, at most.
+    pub(crate) fn candidates(&self) -> usize {
+        let of_icem = |config: &IcemConfig| config.population.max(2 * config.elites) + config.elites + 1;
+        match self {
             PlannerConfig::Shooting(config) => config.population,
-            PlannerConfig::Cem(config) => config.population.min(config.elites).min(config.iterations),
-            PlannerConfig::Icem(config) => config.population.min(config.elites).min(config.iterations),
-            PlannerConfig::Mppi(config) => config.population.min(config.iterations),
+            PlannerConfig::Cem(config) => config.population,
+            PlannerConfig::Icem(config) => of_icem(config),
+            PlannerConfig::Mppi(config) => config.population,
             PlannerConfig::Gradient(config) => config.starts,
-            PlannerConfig::Hybrid(HybridConfig { icem, .. }) => icem.population.min(icem.elites).min(icem.iterations),
-        };
-        if self.horizon() < 2 {
-            return Err(Error::Config("planner: `horizon` must be at least 2".into()));
+            PlannerConfig::Hybrid(config) => of_icem(&config.icem),
         }
-        if candidates == 0 {
-            return Err(Error::Config("planner: population, elites, iterations, starts: at least 1 of each".into()));
-        }
-        Ok(())
     }
 }
+
+ranges!(enum PlannerConfig {
+    "shooting" Shooting: Nested,
+    "cem" Cem: Nested,
+    "icem" Icem: Nested,
+    "mppi" Mppi: Nested,
+    "gradient" Gradient: Nested,
+    "hybrid" Hybrid: Nested,
+});
 
 impl MakePlanner for PlannerConfig {
     fn make(&self, action_size: usize) -> Box<dyn Planner> {

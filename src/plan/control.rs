@@ -6,8 +6,8 @@ use std::collections::VecDeque;
 use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, PlanObserver, Planner, PlannerConfig};
-use crate::error::{Error, Result};
 use crate::rng::Rng;
+use crate::settings::ranges;
 
 /// How plans become control.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -27,19 +27,12 @@ impl Default for ControlConfig {
     }
 }
 
+ranges!(ControlConfig { action_repeat: 1..=1000, replan_every: 1..=1000 });
+
 impl ControlConfig {
-    /// # Errors
-    /// If there is nothing to execute between two plans, or more than a plan holds.
-    pub(crate) fn check(&self, planner: &PlannerConfig) -> Result<()> {
-        planner.check()?;
-        if self.action_repeat == 0 || self.replan_every == 0 || self.replan_every > planner.horizon() {
-            return Err(Error::Config(
-                "control: `action_repeat` and `replan_every` must be at least 1, and `replan_every` no longer than the \
-                 horizon"
-                    .into(),
-            ));
-        }
-        Ok(())
+    /// Whether a plan holds what is executed of it.
+    pub(crate) fn suits(&self, planner: &PlannerConfig) -> bool {
+        self.replan_every <= planner.horizon()
     }
 }
 

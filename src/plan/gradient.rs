@@ -9,6 +9,7 @@ use super::noise::ColoredNoise;
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted};
 use crate::nn::adam_step;
 use crate::rng::Rng;
+use crate::settings::ranges;
 
 /// Settings of [`Gradient`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,6 +37,16 @@ impl Default for GradientConfig {
         Self { horizon: 15, starts: 8, iterations: 20, rate: 0.1, max_norm: 10.0, deviation: 0.5, noise_beta: 2.0 }
     }
 }
+
+ranges!(GradientConfig {
+    horizon: 2..=1000,
+    starts: 1..=100_000,
+    iterations: 1..=10_000,
+    rate: 1e-6..=10.0,
+    max_norm: 1e-6..=1e9,
+    deviation: 0.0..=100.0,
+    noise_beta: 0.0..=10.0,
+});
 
 /// Gradient ascent from several starts.
 #[doc(alias = "gradient shooting")]

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::gradient::ascend;
 use super::{ActionSequences, GradientConfig, Icem, IcemConfig, Objective, Plan, PlanObserver, Planner};
 use crate::rng::Rng;
+use crate::settings::ranges;
 
 /// Settings of [`Hybrid`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,6 +26,8 @@ impl Default for HybridConfig {
         Self { icem: IcemConfig::default(), iterations: 5, rate: 0.05 }
     }
 }
+
+ranges!(HybridConfig { icem: Nested, iterations: 1..=10_000, rate: 1e-6..=10.0 });
 
 /// iCEM, refined by gradient ascent.
 #[derive(Clone, Debug)]

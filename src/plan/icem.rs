@@ -14,6 +14,7 @@ use super::cem::refit;
 use super::noise::ColoredNoise;
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::Rng;
+use crate::settings::ranges;
 
 /// Settings of [`Icem`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -60,6 +61,21 @@ impl Default for IcemConfig {
         }
     }
 }
+
+ranges!(IcemConfig {
+    horizon: 2..=1000,
+    population: 1..=1_000_000,
+    decay: 1.0..=1e6,
+    elites: 1..=1_000_000,
+    iterations: 1..=10_000,
+    momentum: 0.0..=1.0,
+    noise_beta: 0.0..=10.0,
+    start_deviation: 0.0..=100.0,
+    kept: 0.0..=1.0,
+    execute_mean: Any,
+}
+require elites <= population => "`elites` must not exceed `population`";
+);
 
 /// The improved cross-entropy method.
 #[doc(alias = "iCEM")]

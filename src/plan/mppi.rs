@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, shifted};
 use crate::rng::{self, Rng};
+use crate::settings::ranges;
 
 /// Settings of [`Mppi`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,6 +37,15 @@ impl Default for MppiConfig {
         Self { horizon: 15, population: 200, iterations: 2, deviation: 0.8, smoothing: 0.6, temperature: 0.3 }
     }
 }
+
+ranges!(MppiConfig {
+    horizon: 2..=1000,
+    population: 1..=1_000_000,
+    iterations: 1..=10_000,
+    deviation: 0.0..=100.0,
+    smoothing: 1e-3..=1.0,
+    temperature: 1e-6..=1e6,
+});
 
 /// Model predictive path integral control.
 #[doc(alias = "MPPI")]

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best};
 use crate::rng::{self, Rng};
+use crate::settings::ranges;
 
 /// Settings of [`RandomShooting`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -20,6 +21,8 @@ impl Default for ShootingConfig {
         Self { horizon: 15, population: 500 }
     }
 }
+
+ranges!(ShootingConfig { horizon: 2..=1000, population: 1..=1_000_000 });
 
 /// Random shooting: the baseline of planners. It keeps nothing from one plan to the next.
 #[doc(alias = "random shooting")]

@@ -7,7 +7,7 @@ use toml::{Table, Value};
 
 use super::names::check_name;
 use super::starts::{LIMIT, Starts, check_below};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, shortened};
 
 /// Everything that a run's outcome depends on. In TOML the agent's settings stand in the table that is named like it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -47,6 +47,14 @@ pub struct RunConfig {
     pub settings: Table,
 }
 
+/// The first key of a run's `config.toml`: how many values follow. A file that was cut short has fewer, and must not be
+/// completed with defaults.
+const VALUES: &str = "values";
+
+fn count_values(table: &Table) -> i64 {
+    table.values().map(|value| value.as_table().map_or(1, count_values)).sum()
+}
+
 fn default_evaluate_every() -> usize {
     500
 }
@@ -71,6 +79,16 @@ impl RunConfig {
     pub fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
         let mut table: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+        // Files of earlier versions do not tell how many values they have.
+        if let Some(count) = table.remove(VALUES)
+            && (count != Value::Integer(count_values(&table)) || !text.ends_with('\n'))
+        {
+            return Err(Error::Config(format!(
+                "{}: {} values are left of {count}; restore the file, or remove the run",
+                path.display(),
+                count_values(&table)
+            )));
+        }
         upgrade_keys(&mut table);
         let config = Self::from_table(table).map_err(|problem| bad_config(path, &problem))?;
         config.check().map_err(|problem| Error::Config(format!("{}: {problem}", path.display())))?;
@@ -98,7 +116,8 @@ impl RunConfig {
 
     /// The text of `config.toml`.
     pub(crate) fn to_toml(&self) -> String {
-        let mut text = toml::to_string(self).expect("a configuration is TOML");
+        let count = count_values(&self.to_table());
+        let mut text = format!("{VALUES} = {count}\n") + &toml::to_string(self).expect("a configuration is TOML");
         if !self.settings.is_empty() {
             let settings = Table::from_iter([(self.agent.clone(), Value::Table(self.settings.clone()))]);
             text = text + "\n" + &toml::to_string(&settings).expect("settings are TOML");
@@ -123,9 +142,6 @@ impl RunConfig {
                 return Err(Error::Config(format!("`{name}` must be at least 1")));
             }
             check_below(name, value as u64, limit)?;
-        }
-        if self.env.get("horizon").and_then(Value::as_integer) == Some(0) {
-            return Err(Error::Config("`env.horizon` must be at least 1".into()));
         }
         Ok(())
     }
@@ -212,10 +228,14 @@ fn upgrade_table(name: &str, table: &mut Table) {
 /// One line of what is wrong with a configuration; for an unknown field, with the closest known one.
 pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
     let message = source.message();
-    let mut names = message.split('`').skip(1).step_by(2);
-    let problem = match (message.starts_with("unknown field"), names.next()) {
-        (true, Some(field)) => Error::unknown("field", field, names).to_string(),
-        _ => message.trim_end().to_string(),
+    let unknown = message.strip_prefix("unknown field `").and_then(|rest| rest.rsplit_once("`, expected"));
+    let problem = match unknown {
+        Some((field, known)) => Error::unknown("field", field, known.split('`').skip(1).step_by(2)).to_string(),
+        None => shortened(message.trim_end(), 300),
     };
+    // The path of the field is told only as the last line of the whole message.
+    let whole = source.to_string();
+    let place = whole.trim_end().rsplit_once("\nin `").and_then(|(_, place)| place.strip_suffix('`'));
+    let problem = place.map_or(problem.clone(), |place| format!("`{}`: {problem}", shortened(place, 100)));
     Error::ConfigFile { path: path.into(), problem, source: Box::new(source.clone()) }
 }

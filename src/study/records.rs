@@ -123,9 +123,15 @@ pub(super) struct Progress {
 
 impl Progress {
     /// Takes in the losses of an update.
-    pub(super) fn note(&mut self, losses: Losses) {
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] if one is NaN.
+    pub(super) fn note(&mut self, losses: Losses) -> Result<()> {
         let Self { step, losses: rows, pending, .. } = self;
         for (name, value) in losses {
+            if value.is_nan() {
+                return Err(Error::Diverged { what: format!("`{name}`"), step: *step });
+            }
             let (sum, count) = pending.entry(name.into()).or_default();
             (*sum, *count) = (*sum + value, *count + 1);
         }
@@ -133,6 +139,7 @@ impl Progress {
             let means = std::mem::take(pending).into_iter();
             rows.extend(means.map(|(name, (sum, count))| LossRow { step: *step, name, value: sum / count as f32 }));
         }
+        Ok(())
     }
 
     /// Writes the CSV files.

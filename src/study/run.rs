@@ -141,7 +141,7 @@ impl<E: Env> Run<E> {
     /// Acts and learns for one step; at the end of the budget, goes on with the test. Saves when it is time.
     ///
     /// # Errors
-    /// If an action cannot be taken or a file cannot be written.
+    /// If an action cannot be taken, a loss or a weight is NaN, or a file cannot be written.
     pub fn step(&mut self) -> Result<Event> {
         let step = self.progress.step;
         let budget = if self.config.learns() { self.config.steps } else { 0 };
@@ -158,6 +158,9 @@ impl<E: Env> Run<E> {
             return Err(Error::Config(format!("{} does not learn: its `steps` must be 0", self.config.agent)));
         };
         let action = agent.act(&self.obs, Mode::Explore);
+        if action.iter().any(|a| a.is_nan()) {
+            check_weights(&agent.weights(), step)?;
+        }
         let outcome = self.env.step(&action)?;
         agent.observe(&Transition {
             obs: std::mem::take(&mut self.obs),
@@ -172,7 +175,7 @@ impl<E: Env> Run<E> {
         self.progress.step += 1;
         self.episode_return += f64::from(outcome.reward);
         self.episode_length += 1;
-        self.progress.note(losses);
+        self.progress.note(losses)?;
         if !outcome.done() {
             return Ok(Event::Stepped);
         }
@@ -207,6 +210,7 @@ impl<E: Env> Run<E> {
 
     fn evaluate(&mut self) -> Result<Event> {
         let (step, episodes) = (self.progress.step, self.config.evaluation_episodes);
+        check_weights(&self.method.checkpoint().weights(), step)?;
         let evaluation = self.evaluator.evaluate(&mut self.method, episodes, self.config.starts.curve())?;
         let row = EvaluationRow { step, summary: evaluation.summary() };
         if let Some(agent) = self.method.as_learner() {
@@ -237,12 +241,13 @@ impl<E: Env> Run<E> {
     /// present episode anew.
     ///
     /// # Errors
-    /// If a file cannot be written; what was written before is then still there.
+    /// If weights are NaN, or a file cannot be written; what was written before is then still there.
     pub fn save(&mut self) -> Result<()> {
         self.progress.seconds += self.clock.elapsed().as_secs_f64();
         self.clock = Instant::now();
         self.last_save = self.clock;
         let weights = self.method.checkpoint().weights();
+        check_weights(&weights, self.progress.step)?;
         let mut state = self.method.checkpoint().training_state();
         state.absorb("weights.", &weights);
         // TOML, since JSON has no word for a likelihood or a loss that is not a number.
@@ -252,6 +257,15 @@ impl<E: Env> Run<E> {
             weights.write(&self.folder.join("weights.safetensors"))?;
         }
         self.progress.write_tables(&self.folder)
+    }
+}
+
+/// # Errors
+/// If an array holds NaN: nothing can be learned from there on, and no plan or action is worth anything.
+fn check_weights(weights: &Weights, step: usize) -> Result<()> {
+    match weights.with_nan() {
+        Some(name) => Err(Error::Diverged { what: format!("a weight of `{name}`"), step }),
+        None => Ok(()),
     }
 }
 

@@ -170,7 +170,7 @@ fn what_does_not_fit_together_is_refused_when_it_is_made() {
         ),
         (forgetful, TableOptions::default(), "touch-50-mm: `drawn` gives 0 bodies, objects and goal together are 1"),
         (talkative, TableOptions::default(), "touch-50-mm: `observe` gives 17 numbers, `features` names 15"),
-        (Touch::new(0.025), never, "touch-50-mm: `horizon` must be at least 1"),
+        (Touch::new(0.025), never, "`env.horizon` is 0; it must lie in 1..=10000"),
     ] {
         let error = Tabletop::new(task, options).expect_err(expected);
         assert!(matches!(error, Error::Config(_)));

@@ -2,9 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
 use crate::model::WorldModelConfig;
 use crate::plan::{ControlConfig, PlannerConfig};
+use crate::settings::{fits, ranges};
 
 /// Parts of a batch, whose gradients are computed in parallel and averaged. A fixed number: results do not depend on the
 /// machine.
@@ -71,29 +71,37 @@ impl Default for DreamerConfig {
     }
 }
 
-impl DreamerConfig {
-    /// # Errors
-    /// If a setting cannot be used.
-    pub(super) fn check(&self) -> Result<()> {
-        self.world.check()?;
-        self.behaviour.check()?;
-        if let Some(planner) = &self.planner {
-            self.control.check(planner)?;
-        }
-        if !self.batch.is_multiple_of(PARTS) || self.batch == 0 || self.length < 2 {
-            return Err(Error::Config(format!("dreamer: `batch` must be a multiple of {PARTS}, `length` at least 2")));
-        }
-        if self.dreams.is_some_and(|dreams| dreams < 2 || dreams > self.length) {
-            return Err(Error::Config("dreamer: `dreams` must lie between 2 and `length`".into()));
-        }
-        if self.warm_up <= self.length || self.train_ratio <= 0.0 {
-            return Err(Error::Config(
-                "dreamer: `warm_up` must be more than `length`, `train_ratio` more than 0".into(),
-            ));
-        }
-        Ok(())
-    }
+ranges!(DreamerConfig {
+    world: Nested,
+    behaviour: Nested,
+    planner: Nested,
+    control: Nested,
+    learning_rate: 0.0..=1.0,
+    learning_warm_up: 0..=1_000_000_000,
+    batch: 2..=65_536,
+    length: 2..=10_000,
+    dreams: 2..=10_000,
+    train_ratio: 1e-6..=1e6,
+    warm_up: 3..=1_000_000_000,
+    warm_up_noise_beta: 0.0..=10.0,
+    exploration_noise_beta: 0.0..=10.0,
+    replay: 2..=100_000_000,
 }
+require batch.is_multiple_of(PARTS) => "`batch` must be even";
+require dreams.is_none_or(|dreams| dreams <= *length) => "`dreams` must not exceed `length`";
+require warm_up > length => "`warm_up` must be more than `length`";
+require replay >= length => "`replay` must hold at least `length` time steps";
+require *train_ratio <= (100 * batch * length) as f32 => "`train_ratio` must not exceed 100 times `batch` times `length`";
+require planner.as_ref().is_none_or(|planner| control.suits(planner)) =>
+    "`control.replan_every` must not exceed the planner's `horizon`";
+require planner.as_ref().is_none_or(|planner| {
+    fits(&[planner.candidates(), planner.horizon() * control.action_repeat + world.widest()])
+}) => "the planner's candidates do not fit into memory";
+require fits(&[*batch, *length, world.widest().max(behaviour.units)]) =>
+    "`batch` times `length` times the widest layer does not fit into memory";
+require fits(&[*batch, dreams.unwrap_or(*length), behaviour.horizon, world.widest().max(behaviour.units)]) =>
+    "`batch` times `dreams` times `behaviour.horizon` times the widest layer does not fit into memory";
+);
 
 /// Settings of an [`super::ActorCritic`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -133,16 +141,13 @@ impl Default for ActorCriticConfig {
     }
 }
 
-impl ActorCriticConfig {
-    /// # Errors
-    /// If a setting cannot be used.
-    pub(crate) fn check(&self) -> Result<()> {
-        if self.units == 0 || self.layers == 0 || self.horizon == 0 {
-            return Err(Error::Config("dreamer: `units`, `layers` and `horizon` must be at least 1".into()));
-        }
-        if !(0.0..=1.0).contains(&self.lambda) || !(0.0..1.0).contains(&self.min_std) || self.min_std <= 0.0 {
-            return Err(Error::Config("dreamer: `lambda` must lie in [0, 1], `min_std` between 0 and 1".into()));
-        }
-        Ok(())
-    }
-}
+ranges!(ActorCriticConfig {
+    units: 1..=4096,
+    layers: 1..=16,
+    horizon: 1..=1000,
+    lambda: 0.0..=1.0,
+    entropy: 0.0..=1e3,
+    min_std: 1e-4..=0.999,
+    slow_rate: 0.0..=1.0,
+    replayed: 0.0..=1e3,
+});

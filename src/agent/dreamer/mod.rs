@@ -46,6 +46,7 @@ use crate::model::open_loop::{OpenLoop, open_loop};
 use crate::nn::{Adam, AdamConfig};
 use crate::replay::{Episode, SequenceReplay, Transition};
 use crate::rng::{self, Rng};
+use crate::settings::Ranges;
 
 /// Imagined rollouts that explain an action.
 const SHOWN: usize = 12;
@@ -89,7 +90,7 @@ impl Dreamer {
     /// # Errors
     /// If a setting cannot be used.
     pub fn new(spec: &Spec, config: DreamerConfig, seed: u64) -> Result<Self> {
-        config.check()?;
+        config.check_at("dreamer")?;
         spec.check()?;
         let mut rng = rng::stream(seed, "dreamer");
         let world = WorldModel::new(spec, &config.world, &mut rng);

@@ -2,10 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
 use crate::model::uncertainty::Risk;
 use crate::model::{EnsembleConfig, Propagation};
 use crate::plan::{ControlConfig, IcemConfig, PlannerConfig};
+use crate::settings::{fits, ranges};
 
 /// Settings of [`Pets`](super::Pets). [`Preset`](crate::agent::Preset) has tuned ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -64,18 +64,23 @@ impl Default for PetsConfig {
     }
 }
 
-impl PetsConfig {
-    pub(super) fn check(&self) -> Result<()> {
-        self.control.check(&self.planner)?;
-        if !self.particles.is_multiple_of(self.ensemble.elites) || self.particles == 0 {
-            return Err(Error::Config(format!(
-                "pets: `particles` must be a multiple of the {} elites of the ensemble",
-                self.ensemble.elites
-            )));
-        }
-        if self.warm_up < 2 || self.fit_every == 0 {
-            return Err(Error::Config("pets: `warm_up` must be at least 2, `fit_every` at least 1".into()));
-        }
-        Ok(())
-    }
+ranges!(PetsConfig {
+    ensemble: Nested,
+    planner: Nested,
+    control: Nested,
+    terminal_weight: 0.0..=1e6,
+    propagation: Any,
+    particles: 1..=10_000,
+    risk: Nested,
+    disagreement_penalty: -1e6..=1e6,
+    disagreement_bonus: -1e6..=1e6,
+    warm_up: 2..=1_000_000_000,
+    warm_up_noise_beta: 0.0..=10.0,
+    fit_every: 1..=1_000_000_000,
+    replay: 32..=100_000_000,
 }
+require particles.is_multiple_of(ensemble.elites) => "`particles` must be a multiple of `ensemble.elites`";
+require control.suits(planner) => "`control.replan_every` must not exceed the planner's `horizon`";
+require fits(&[planner.candidates(), planner.horizon(), control.action_repeat, *particles]) =>
+    "the planner's candidates times `horizon` times `control.action_repeat` times `particles` do not fit into memory";
+);

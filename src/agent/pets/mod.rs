@@ -39,6 +39,7 @@ use crate::model::{Dynamics, Ensemble};
 use crate::plan::{ActionSequences, Iteration, MakePlanner};
 use crate::replay::{ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
+use crate::settings::Ranges;
 
 /// A known reward, shared between threads.
 type DynReward = dyn KnownReward + Send + Sync;
@@ -105,12 +106,12 @@ impl Pets {
     /// # Errors
     /// If a setting cannot be used, or the reward is neither known nor learned.
     pub fn new(spec: &Spec, reward: Option<Arc<DynReward>>, config: PetsConfig, seed: u64) -> Result<Self> {
-        config.check()?;
+        config.check_at("pets")?;
         spec.check()?;
         let reward = reward.filter(|reward| reward.is_known());
         if reward.is_none() && !config.ensemble.learn_reward {
             return Err(Error::Config(format!(
-                "pets: the reward of `{}` is not known as a function of observations; set `ensemble.learn_reward = true`",
+                "pets: the reward of `{}` is not known as a function of observations; set `pets.ensemble.learn_reward = true`",
                 spec.name
             )));
         }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
+use crate::settings::{fits, ranges, weights_between};
 
 /// Settings of [`Sac`](super::Sac). [`Preset`](crate::agent::Preset) has tuned ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -69,28 +69,23 @@ impl Default for SacConfig {
     }
 }
 
-impl SacConfig {
-    pub(super) fn check(&self) -> Result<()> {
-        let positive = [
-            ("critics", self.critics),
-            ("batch", self.batch),
-            ("replay", self.replay),
-            ("critic_updates_per_policy_update", self.critic_updates_per_policy_update),
-        ];
-        for (name, value) in positive {
-            if value == 0 {
-                return Err(Error::Config(format!("sac: `{name}` must be at least 1")));
-            }
-        }
-        if self.hidden.is_empty() || self.hidden.contains(&0) {
-            return Err(Error::Config("sac: `hidden` must name at least one layer, each at least 1 wide".into()));
-        }
-        if !(0.0..=1.0).contains(&self.discount) || !(0.0..=1.0).contains(&self.polyak) {
-            return Err(Error::Config("sac: `discount` and `polyak` must lie in [0, 1]".into()));
-        }
-        if self.initial_temperature.is_nan() || self.initial_temperature <= 0.0 {
-            return Err(Error::Config("sac: `initial_temperature` must be positive".into()));
-        }
-        Ok(())
-    }
+ranges!(SacConfig {
+    hidden: 1..=4096,
+    layer_norm: Any,
+    critics: 1..=32,
+    learning_rate: 0.0..=1.0,
+    temperature_rate: 0.0..=1.0,
+    initial_temperature: 1e-6..=1e4,
+    target_entropy: -100.0..=100.0,
+    batch: 1..=65_536,
+    discount: 0.0..=1.0,
+    polyak: 0.0..=1.0,
+    replay: 1..=100_000_000,
+    warm_up: 0..=1_000_000_000,
+    updates_per_step: 1..=1000,
+    critic_updates_per_policy_update: 1..=1_000_000,
+    max_gradient_norm: 1e-6..=1e9,
 }
+require fits(&[*critics, weights_between(hidden)]) => "`critics` with the layers of `hidden` have too many weights";
+require fits(&[*critics, *batch, hidden.iter().sum()]) => "`critics` times `batch` times `hidden` does not fit into memory";
+);

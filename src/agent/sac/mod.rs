@@ -29,6 +29,7 @@ use crate::nn::{
 };
 use crate::replay::{Batch, ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
+use crate::settings::Ranges;
 
 /// Scaled observations are clamped to this.
 const MAX_INPUT: f32 = 10.0;
@@ -85,7 +86,7 @@ impl Sac {
     /// # Errors
     /// If a setting or the spec cannot be used.
     pub fn new(spec: &Spec, config: SacConfig, seed: u64) -> Result<Self> {
-        config.check()?;
+        config.check_at("sac")?;
         spec.check()?;
         let cpu = device();
         let mut rng = rng::stream(seed, "sac");

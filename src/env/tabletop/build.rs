@@ -11,6 +11,7 @@ use crate::env::physics::{CONTROL_HZ, Physics};
 use crate::env::{Feature, Spec};
 use crate::error::{Error, Result};
 use crate::rng;
+use crate::settings::Ranges;
 
 impl Tabletop {
     /// The Panda at the table with `task`.
@@ -27,6 +28,7 @@ impl Tabletop {
     /// # Errors
     /// As for [`Tabletop::new`].
     pub fn with_shared(task: Arc<dyn TableTask>, options: TableOptions) -> Result<Self> {
+        options.check_at("env")?;
         let arm = ArmDescription::panda();
         let empty = Physics::new(arm.clone());
         let home = empty.kinematics(&arm.home);

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::settings::ranges;
+
 /// The kind of reward.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -62,6 +64,8 @@ pub struct TableOptions {
     /// Control steps in an episode; the task's own number if absent.
     pub horizon: Option<usize>,
 }
+
+ranges!(TableOptions { reward: Any, action: Any, observation: Any, horizon: 1..=10_000 });
 
 impl TableOptions {
     /// A hand motion and gripper command (dx, dy, dz, grip), clipped to [-1, 1], as the action that these options ask for.

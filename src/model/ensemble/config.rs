@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
+use crate::settings::{fits, ranges, weights_between};
 
 /// Settings of an [`Ensemble`](super::Ensemble).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -88,28 +88,34 @@ impl Default for EnsembleConfig {
     }
 }
 
-impl EnsembleConfig {
-    pub(super) fn check(&self) -> Result<()> {
-        for (name, value) in [("members", self.members), ("batch", self.batch), ("check_every", self.check_every)] {
-            if value == 0 {
-                return Err(Error::Config(format!("ensemble: `{name}` must be at least 1")));
-            }
-        }
-        if self.elites == 0 || self.elites > self.members {
-            return Err(Error::Config("ensemble: `elites` must lie between 1 and `members`".into()));
-        }
-        if self.hidden.is_empty() || self.hidden.contains(&0) {
-            return Err(Error::Config("ensemble: `hidden` needs at least one layer, each at least 1 wide".into()));
-        }
-        if !(0.0..0.9).contains(&self.held_out) {
-            return Err(Error::Config("ensemble: `held_out` must lie in [0, 0.9)".into()));
-        }
-        if !(0.0..=1.0).contains(&self.final_learning_rate_fraction) {
-            return Err(Error::Config("ensemble: `final_learning_rate_fraction` must lie in [0, 1]".into()));
-        }
-        Ok(())
-    }
+ranges!(EnsembleConfig {
+    members: 1..=100,
+    elites: 1..=100,
+    hidden: 1..=4096,
+    learning_rate: 0.0..=1.0,
+    final_learning_rate_fraction: 0.0..=1.0,
+    weight_decay: 0.0..=100.0,
+    batch: 1..=65_536,
+    bootstrap: Any,
+    held_out: 0.0..=0.9,
+    first_steps: 0..=1_000_000,
+    steps: 0..=1_000_000,
+    check_every: 1..=1_000_000,
+    patience: 1..=1_000_000,
+    learn_bounds: Any,
+    beta: 0.0..=1.0,
+    max_target: 1e-3..=1e6,
+    learn_reward: Any,
+    gated: Any,
+}
+require elites <= members => "`elites` must not exceed `members`";
+require fits(&[*members, weights_between(hidden)]) => "`members` with the layers of `hidden` have too many weights";
+require fits(&[*members, *batch, hidden.iter().sum()]) => "`members` times `batch` times `hidden` does not fit into memory";
+require fits(&[*members, *batch, *check_every.min(first_steps.max(steps))]) =>
+    "`members` times `batch` times `check_every` does not fit into memory";
+);
 
+impl EnsembleConfig {
     /// The learning rate at `step` of a fit of `steps`.
     pub(super) fn learning_rate_at(&self, step: usize, steps: usize) -> f32 {
         self.learning_rate * (1.0 - (1.0 - self.final_learning_rate_fraction) * step as f32 / steps as f32)

@@ -53,6 +53,7 @@ use crate::env::Spec;
 use crate::error::Result;
 use crate::nn::{Activation, Adam, AdamConfig, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, Weights, device};
 use crate::rng::Rng;
+use crate::settings::Ranges;
 
 /// A probabilistic ensemble in training: networks, optimisers and normalisation. [`Ensemble::dynamics`] is the snapshot
 /// that predicts.
@@ -84,7 +85,7 @@ impl Ensemble {
     /// [`Error::Config`](crate::error::Error::Config) if a setting is out of range, or for the reasons of
     /// [`FeatureMap::new`].
     pub fn new(spec: &Spec, config: EnsembleConfig, rng: &mut Rng) -> Result<Self> {
-        config.check()?;
+        config.check_at("ensemble")?;
         let cpu = device();
         let (features, actions) = (FeatureMap::new(spec)?, spec.action_size);
         let features = if config.learn_reward { features.with_goals(spec) } else { features };

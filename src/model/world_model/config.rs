@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
 use crate::model::RssmConfig;
+use crate::settings::{fits, ranges};
 
 /// Settings of a [`super::WorldModel`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,20 +52,26 @@ impl Default for WorldModelConfig {
     }
 }
 
+ranges!(WorldModelConfig {
+    rssm: Nested,
+    units: 1..=4096,
+    layers: 1..=16,
+    bins: 3..=4095,
+    bin_limit: 0.1..=80.0,
+    free_nats: 0.0..=1e3,
+    reconstruction: 0.0..=1e6,
+    dynamics: 0.0..=1e3,
+    representation: 0.0..=1e3,
+    discount_horizon: 1.01..=1e6,
+}
+require !bins.is_multiple_of(2) => "`bins` must be odd";
+require fits(&[*units, rssm.features()]) => "`units` times the numbers of a latent state are too many weights";
+);
+
 impl WorldModelConfig {
-    /// # Errors
-    /// If a setting cannot be used.
-    pub(crate) fn check(&self) -> Result<()> {
-        self.rssm.check()?;
-        if self.units == 0 || self.layers == 0 || self.bins < 3 || self.bins.is_multiple_of(2) {
-            return Err(Error::Config(
-                "world model: `units` and `layers` must be at least 1, `bins` odd and at least 3".into(),
-            ));
-        }
-        if self.discount_horizon <= 1.0 {
-            return Err(Error::Config("world model: `discount_horizon` must be more than 1".into()));
-        }
-        Ok(())
+    /// Numbers in the widest layer.
+    pub(crate) fn widest(&self) -> usize {
+        self.units.max(self.bins).max(self.rssm.features()).max(3 * self.rssm.deter)
     }
 
     /// The discount of a step.

@@ -3,10 +3,11 @@
 use toml::Table;
 
 use super::Registry;
-use super::envs::{ErasedEnv, NoOptions, Settings, SharedReward, completed};
+use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, SharedReward, completed, in_range};
 use crate::agent::{Dreamer, DreamerConfig, Method, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig};
 use crate::env::Spec;
 use crate::error::{Error, Result};
+use crate::settings::{Ranges, choices};
 
 /// What an agent is made from, beside its settings.
 pub struct AgentContext<'a> {
@@ -55,7 +56,9 @@ impl std::fmt::Debug for AgentContext<'_> {
 pub(super) struct AgentEntry {
     pub(super) name: String,
     pub(super) learns: bool,
-    pub(super) complete: fn(Table) -> Result<Table, toml::de::Error>,
+    pub(super) complete: Complete,
+    pub(super) check: Check,
+    pub(super) choices: Vec<String>,
     #[allow(clippy::type_complexity)] // a closure's type, named once
     pub(super) make: Box<dyn Fn(&AgentContext, Table) -> Result<Method> + Send + Sync>,
 }
@@ -70,21 +73,42 @@ impl AgentEntry {
             let problem = |problem: toml::de::Error| Error::Config(problem.message().into());
             make(context, table.try_into().map_err(problem)?)
         };
-        Self { name: name.into(), learns, complete: completed::<C>, make: Box::new(make) }
+        let choices = choices::<C>(name);
+        Self {
+            name: name.into(),
+            learns,
+            complete: completed::<C>,
+            check: |_, _| Ok(()),
+            choices,
+            make: Box::new(make),
+        }
+    }
+
+    /// Its settings have ranges, which are checked before anything is made.
+    fn with_ranges<C: Settings + Ranges>(self) -> Self {
+        Self { check: in_range::<C>, ..self }
     }
 }
 
 /// The agents of this crate.
 pub(super) fn register(registry: Registry) -> Registry {
-    let oracle = AgentEntry::new("oracle", false, |context, config| context.oracle(config));
+    let oracle =
+        AgentEntry::new("oracle", false, |context, config| context.oracle(config)).with_ranges::<OracleConfig>();
+    let sac = AgentEntry::new("sac", true, |context, config: SacConfig| {
+        Ok(Method::learner(Sac::new(context.spec, config, context.seed)?))
+    });
+    let dreamer = AgentEntry::new("dreamer", true, |context, config: DreamerConfig| {
+        Ok(Method::learner(Dreamer::new(context.spec, config, context.seed)?))
+    });
+    let pets = AgentEntry::new("pets", true, |context, config: PetsConfig| {
+        Ok(Method::learner(Pets::new(context.spec, context.known_reward()?, config, context.seed)?))
+    });
     let scripted = AgentEntry::new("scripted", false, |context, NoOptions {}| context.scripted());
     registry
         .add_agent(oracle)
         .add_agent(scripted)
         .policy("random", |context, NoOptions {}| Ok(Random::new(context.spec, context.seed)))
-        .agent("sac", |context, config: SacConfig| Sac::new(context.spec, config, context.seed))
-        .agent("dreamer", |context, config: DreamerConfig| Dreamer::new(context.spec, config, context.seed))
-        .agent("pets", |context, config: PetsConfig| {
-            Pets::new(context.spec, context.known_reward()?, config, context.seed)
-        })
+        .add_agent(sac.with_ranges::<SacConfig>())
+        .add_agent(dreamer.with_ranges::<DreamerConfig>())
+        .add_agent(pets.with_ranges::<PetsConfig>())
 }

@@ -1,16 +1,18 @@
 //! Registered environments.
 
+use std::collections::BTreeMap;
 use std::marker::PhantomData;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
-use toml::Table;
+use toml::{Table, Value};
 
 use super::Registry;
 use crate::agent::{Method, Oracle, OracleConfig, Scripted};
 use crate::env::tabletop::{ObservationKind, TableOptions, TableTask, Tabletop};
 use crate::env::{Env, KnownReward, Snapshot, Task};
 use crate::error::{Error, Result};
+use crate::settings::{Ranges, choices};
 use crate::study::config::settings_table;
 
 /// Settings that are read from TOML and written to it with all defaults filled in.
@@ -32,6 +34,7 @@ type MakeOracle<O> = Arc<dyn Fn(&O, OracleConfig, u64) -> Result<Method> + Send 
 /// the table `[env]` of a preset or configuration file.
 pub struct EnvEntry<E, O = NoOptions> {
     name: String,
+    check: Check,
     make: Make<O, E>,
     known_reward: Option<Make<O, Option<SharedReward>>>,
     oracle: Option<MakeOracle<O>>,
@@ -56,7 +59,16 @@ impl<E: Env, O: Settings> EnvEntry<E, O> {
     /// An environment with options.
     pub fn with_options(name: &str, make: impl Fn(&O) -> Result<E> + Send + Sync + 'static) -> Self {
         let make = Arc::new(make);
-        Self { name: name.into(), make, known_reward: None, oracle: None, scripted: None, env: PhantomData }
+        let check: Check = |_, _| Ok(());
+        Self { name: name.into(), check, make, known_reward: None, oracle: None, scripted: None, env: PhantomData }
+    }
+
+    /// Its options have ranges, which are checked before anything is made.
+    fn with_ranges(self) -> Self
+    where
+        O: Ranges,
+    {
+        Self { check: in_range::<O>, ..self }
     }
 
     /// Its reward is known as a function of observations: agents that plan need not learn it.
@@ -111,6 +123,7 @@ impl EnvEntry<Tabletop, TableOptions> {
             move |options: &TableOptions| Tabletop::with_shared(task.clone(), *options)
         };
         Self::with_options(task.name(), make.clone())
+            .with_ranges()
             .with_known_reward_if(|options| options.observation == ObservationKind::Compact)
             .with_oracle()
             .with_scripted(move |options| {
@@ -123,10 +136,22 @@ impl EnvEntry<Tabletop, TableOptions> {
     }
 }
 
-/// The table of settings with all defaults filled in.
-pub(super) fn completed<S: Settings>(table: Table) -> Result<Table, toml::de::Error> {
-    let settings: S = table.try_into()?;
-    Ok(settings_table(&settings))
+/// Fills in the defaults of the settings in a table that stands at a path.
+pub(super) type Complete = fn(&str, Table) -> Result<Table, toml::de::Error>;
+
+/// The [`Complete`] of a type of settings. They are read from where they stand, so that errors tell the whole path.
+pub(super) fn completed<S: Settings>(path: &str, table: Table) -> Result<Table, toml::de::Error> {
+    let outer = Table::from_iter([(path.to_string(), Value::Table(table))]);
+    let settings: BTreeMap<String, S> = outer.try_into()?;
+    Ok(settings_table(&settings[path]))
+}
+
+/// Checks the settings in a table that stands at a path.
+pub(super) type Check = fn(&str, &Table) -> Result<()>;
+
+/// The [`Check`] of settings that have ranges.
+pub(super) fn in_range<S: Settings + Ranges>(path: &str, table: &Table) -> Result<()> {
+    parsed::<S>(table)?.check_at(path)
 }
 
 fn parsed<S: Settings>(table: &Table) -> Result<S> {
@@ -138,7 +163,9 @@ type Erased<T> = Box<dyn Fn(&Table) -> Result<T> + Send + Sync>;
 /// An [`EnvEntry`] without its types.
 pub(super) struct ErasedEnv {
     pub(super) name: String,
-    pub(super) complete: fn(Table) -> Result<Table, toml::de::Error>,
+    pub(super) complete: Complete,
+    pub(super) check: Check,
+    pub(super) choices: Vec<String>,
     pub(super) make: Erased<Box<dyn Env>>,
     pub(super) known_reward: Option<Erased<Option<SharedReward>>>,
     #[allow(clippy::type_complexity)] // a closure's type, named once
@@ -148,10 +175,12 @@ pub(super) struct ErasedEnv {
 
 impl<E: Env, O: Settings> EnvEntry<E, O> {
     pub(super) fn erased(self) -> ErasedEnv {
-        let Self { name, make, known_reward, oracle, scripted, .. } = self;
+        let Self { name, check, make, known_reward, oracle, scripted, .. } = self;
         ErasedEnv {
             name,
             complete: completed::<O>,
+            check,
+            choices: choices::<O>("env"),
             make: Box::new(move |options| Ok(Box::new(make(&parsed(options)?)?))),
             known_reward: known_reward.map(|make| Box::new(move |o: &Table| make(&parsed(o)?)) as Erased<_>),
             oracle: oracle.map(|make| {
@@ -167,6 +196,7 @@ impl<E: Env, O: Settings> EnvEntry<E, O> {
 pub(super) fn register(registry: Registry) -> Registry {
     Task::ALL.into_iter().fold(registry, |registry, task| {
         let entry = EnvEntry::with_options(task.name(), move |options: &TableOptions| task.make_with(*options))
+            .with_ranges()
             .with_known_reward_if(|options| options.observation == ObservationKind::Compact)
             .with_oracle();
         let scripted = task.scripted_policy(TableOptions::default()).is_some();

@@ -32,11 +32,16 @@ pub use envs::{EnvEntry, NoOptions, Settings};
 use super::config::{RunConfig, bad_config, upgrade_keys};
 use super::run::Run;
 use super::starts::{LIMIT, check_below};
-use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, merge, preset_table, specialise};
+use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, preset_table, specialise};
 use crate::checkpoint::Weights;
 use crate::env::Env;
 use crate::error::{Error, Result};
 use crate::rng;
+use crate::settings::{check_choices, merge};
+
+/// What a run is named by, and so cannot be changed by a file of settings.
+const SET_ELSEWHERE: [(&str, &str); 4] =
+    [("task", "--task"), ("method", "--method"), ("seed", "--seed"), ("shake", rng::SHAKE)];
 
 /// Environments, agents and presets by name. A name has up to 64 letters (A to Z), digits, and `-` or `_` between them: it
 /// becomes a folder and a part of reports. Another one is refused by [`Registry::config`].
@@ -139,15 +144,14 @@ impl Registry {
         steps: Option<usize>,
         file: Option<&Path>,
     ) -> Result<RunConfig> {
-        self.env_entry(task)?;
-        let mut table = preset_table(&self.presets, task, method)?;
+        let env = self.env_entry(task)?;
+        let choices = self.agents.iter().flat_map(|agent| &agent.choices).chain(&env.choices).cloned();
+        let choices: Vec<String> = choices.collect();
+        let mut table = preset_table(&self.presets, task, method, &choices)?;
         if let Some(path) = file {
-            let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
-            let mut changes: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
-            specialise(&mut changes, task);
-            // Otherwise an old name would stand beside the new one that the preset uses.
-            upgrade_keys(&mut changes);
-            merge(&mut table, changes);
+            let changes = self.changes(path, task, table.get("agent"), &choices)?;
+            merge(&mut table, changes, &choices);
+            check_choices(&table, &choices)?;
         }
         table.insert("task".into(), Value::String(task.into()));
         table.insert("method".into(), Value::String(method.into()));
@@ -165,18 +169,42 @@ impl Registry {
         Ok(config)
     }
 
+    /// What a file changes for a task, in a method with this kind of `agent`.
+    fn changes(&self, path: &Path, task: &str, agent: Option<&Value>, choices: &[String]) -> Result<Table> {
+        let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
+        let mut changes: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+        let wrong = |problem: String| Error::Config(format!("{}: {problem}", path.display()));
+        let mut tasks = changes.get("for").and_then(Value::as_table).into_iter().flat_map(Table::keys);
+        tasks.try_for_each(|task| self.env_entry(task).map(|_| ())).map_err(|problem| wrong(problem.to_string()))?;
+        // Otherwise an old name would stand beside the new one that the preset uses.
+        upgrade_keys(&mut changes);
+        specialise(&mut changes, task, choices).map_err(|problem| wrong(problem.to_string()))?;
+        for (key, instead) in SET_ELSEWHERE {
+            if changes.contains_key(key) {
+                return Err(wrong(format!("`{key}` cannot be set in a file; set it by {instead}")));
+            }
+        }
+        match (changes.get("agent"), agent) {
+            (Some(named), Some(agent)) if named != agent => {
+                Err(wrong(format!("`agent` cannot be changed, it is {agent}; choose another method by --method")))
+            }
+            _ => Ok(changes),
+        }
+    }
+
     /// Fills in the defaults of environment and agent.
     fn complete(&self, config: &mut RunConfig) -> Result<Result<()>, toml::de::Error> {
         let (env, agent) = match (self.env_entry(&config.task), self.agent_entry(&config.agent)) {
             (Ok(env), Ok(agent)) => (env, agent),
             (Err(problem), _) | (_, Err(problem)) => return Ok(Err(problem)),
         };
-        config.env = (env.complete)(std::mem::take(&mut config.env))?;
-        config.settings = (agent.complete)(std::mem::take(&mut config.settings))?;
+        config.env = (env.complete)("env", std::mem::take(&mut config.env))?;
+        config.settings = (agent.complete)(&config.agent, std::mem::take(&mut config.settings))?;
         if !agent.learns {
             config.steps = 0;
         }
-        Ok(config.check())
+        let in_range = || (env.check)("env", &config.env).and_then(|()| (agent.check)(&config.agent, &config.settings));
+        Ok(config.check().and_then(|()| in_range()))
     }
 
     /// The environment of a run.
