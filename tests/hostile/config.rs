@@ -277,6 +277,9 @@ fn nothing_is_ignored() {
         assert!(problem.to_string().contains(expected) && brief(&problem), "{text}: {problem}");
     }
     config_of("pets", "agent = 'pets'").expect("nothing is changed by it");
+    let circle = Registry::standard().preset("hen", "base = 'egg'").preset("egg", "base = 'hen'");
+    let problem = circle.config("reach", "hen", 0, None, None).expect_err("no first preset").to_string();
+    assert!(problem.contains("its own `base`"), "{problem}");
     let long = "k".repeat(10_000_000);
     for text in
         [format!("{long} = 1"), format!("[for.{long}]"), format!("pets = '{long}'"), format!("pets.risk = '{long}'")]
