@@ -281,9 +281,14 @@ fn nothing_is_ignored() {
     let problem = circle.config("reach", "hen", 0, None, None).expect_err("no first preset").to_string();
     assert!(problem.contains("its own `base`"), "{problem}");
     let long = "k".repeat(10_000_000);
-    for text in
-        [format!("{long} = 1"), format!("[for.{long}]"), format!("pets = '{long}'"), format!("pets.risk = '{long}'")]
-    {
+    for text in [
+        format!("{long} = 1"),
+        format!("[for.{long}]"),
+        format!("pets = '{long}'"),
+        format!("pets.risk = '{long}'"),
+        format!("pets.risk = {{ cvar = 0.5, {long} = 1 }}"),
+        "pets.risk = { cvar = 0.5, \"\\n\\n\\n\" = 1 }".into(),
+    ] {
         let problem = config_of("pets", &text).expect_err("ten megabytes");
         assert!(brief(&problem), "{} bytes", problem.to_string().len());
     }
