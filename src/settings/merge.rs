@@ -3,7 +3,7 @@
 use toml::{Table, Value};
 
 use super::below;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, shortened};
 
 /// Puts `over` over `base`, table by table. `choices` are the paths of tables that name a variant, like the planner:
 /// another variant takes the place of the one that is there, and the same one is merged with it.
@@ -35,7 +35,7 @@ pub(crate) fn check_choices(table: &Table, choices: &[String]) -> Result<()> {
         }
         if let Some(variants) = value.filter(|variants| variants.len() != 1) {
             let named: Vec<&str> = variants.keys().map(String::as_str).collect();
-            let named = if named.is_empty() { "none".into() } else { named.join(", ") };
+            let named = if named.is_empty() { "none".into() } else { shortened(&named.join(", "), 100) };
             return Err(Error::Config(format!("`{path}` is a choice, so name exactly one variant; it names {named}")));
         }
     }

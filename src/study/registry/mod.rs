@@ -200,8 +200,9 @@ impl Registry {
         };
         config.env = (env.complete)("env", std::mem::take(&mut config.env))?;
         config.settings = (agent.complete)(&config.agent, std::mem::take(&mut config.settings))?;
-        if !agent.learns {
-            config.steps = 0;
+        if !agent.learns && config.steps > 0 {
+            let problem = format!("`steps` is {}, but {} does not learn; leave it out", config.steps, config.method);
+            return Ok(Err(Error::Config(problem)));
         }
         let in_range = || (env.check)("env", &config.env).and_then(|()| (agent.check)(&config.agent, &config.settings));
         Ok(config.check().and_then(|()| in_range()))
