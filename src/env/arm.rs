@@ -13,7 +13,7 @@
 //! assert!((mass - 14.8).abs() < 1e-9, "{mass} kg with the hand");
 //! ```
 
-use nalgebra::{Isometry3, Matrix3, Quaternion, SVector, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Quaternion, SVector, Translation3, UnitQuaternion, Vector3};
 
 pub use super::inertia::Inertia;
 
