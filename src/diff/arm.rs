@@ -1,4 +1,4 @@
-//! The arm in free space: the dynamics that [`crate::env::Tabletop`] has while the hand touches nothing but what it holds.
+//! The arm in free space: the dynamics that [`crate::env::tabletop::Tabletop`] has while the hand touches nothing but what it holds.
 //!
 //! Kinematics and controller are the world's own, written once for any kind of number. The integrator is written again here,
 //! because rapier's knows f32 only: semi-implicit Euler on M(q) q'' = tau - c(q, q') - D q' - friction, with implicit damping.
