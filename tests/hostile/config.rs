@@ -108,7 +108,7 @@ fn registry() -> Registry {
 fn whole_file(method: &str) -> Table {
     let config = config_of(method, "").expect("a small run");
     let mut table = Table::try_from(&config).expect("a configuration is TOML");
-    table.retain(|key, _| !["task", "method", "seed", "agent"].contains(&key));
+    table.retain(|key, _| !["task", "method", "seed", "shake", "agent"].contains(&key));
     table.insert(config.agent, Value::Table(config.settings));
     table
 }
