@@ -37,6 +37,8 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["train", "--task", "reach", "--method", "sca"], &["unknown method `sca`", "`sac`"]);
     refused(here, &["study", "--tasks", "lfit"], &["unknown task `lfit`", "`lift`"]);
     refused(here, &["study", "--methods", "random,petz"], &["unknown method `petz`"]);
+    refused(here, &["study", "--tasks", "pendulum,pendulum"], &["the task `pendulum` is named twice"]);
+    refused(here, &["study", "--methods", "random,debug,debug"], &["the method `debug` is named twice"]);
     refused(here, &["study", "--seeds", "3..3"], &["no seeds", "3..3"]);
     refused(here, &["study", "--seeds", "0"], &["no seeds"]);
     refused(here, &["study", "--seeds", "few"], &["'few'", "--seeds", "a number of seeds"]);
@@ -178,10 +180,10 @@ fn train_evaluate_and_watch() {
 
 #[cfg(unix)]
 #[test]
-fn ctrl_c_leaves_a_run_that_resumes() {
+fn signals_leave_a_run_that_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let here = folder.path();
-    let train = ["train", "--task", "reach", "--method", "debug", "--steps", "20000", "--out", "run"];
+    let train = ["train", "--task", "reach", "--method", "debug", "--steps", "200000", "--out", "run"];
     let start = || {
         Command::new(env!("CARGO_BIN_EXE_handful"))
             .current_dir(here)
@@ -191,17 +193,21 @@ fn ctrl_c_leaves_a_run_that_resumes() {
             .spawn()
             .expect("the program starts")
     };
-    let child = start();
-    std::thread::sleep(Duration::from_secs(4));
-    let kill = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
-    assert!(kill.success());
-    let output = child.wait_with_output().expect("the program ends");
-    let said = text(&output.stderr);
-    assert_eq!(output.status.code(), Some(130), "{said}");
-    assert!(said.contains("the same command resumes it"), "{said}");
-    let episodes = std::fs::read_to_string(here.join("run/episodes.csv")).expect("episodes");
-    let done = episodes.lines().count() - 1;
-    assert!(done > 0, "{said}");
+    let mut done = 0;
+    // Ctrl-C, what a system sends before it kills, and the end of a terminal.
+    for signal in ["-INT", "-TERM", "-HUP"] {
+        let child = start();
+        std::thread::sleep(Duration::from_secs(2));
+        let kill = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
+        assert!(kill.success());
+        let output = child.wait_with_output().expect("the program ends");
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(130), "{signal}: {said}");
+        assert!(said.contains("the same command resumes it"), "{signal}: {said}");
+        let episodes = std::fs::read_to_string(here.join("run/episodes.csv")).expect("episodes");
+        let before = std::mem::replace(&mut done, episodes.lines().count() - 1);
+        assert!(done > before, "{signal}: {said}");
+    }
 
     // Going on for a moment is enough to see that it starts from there.
     let mut child = start();

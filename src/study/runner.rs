@@ -53,7 +53,7 @@ impl StudyPlan {
     /// The runs, each with its folder. A method that does not learn runs once.
     ///
     /// # Errors
-    /// If there is nothing to run, a seed is not below [`LIMIT`], or a method or task is unknown.
+    /// If there is nothing to run, something is to be run twice, a seed is not below [`LIMIT`], or a method or task is unknown.
     pub fn runs(&self, registry: &Registry) -> Result<Vec<(RunConfig, PathBuf)>> {
         if self.seeds.is_empty() {
             return Err(Error::Config(format!(
@@ -64,6 +64,13 @@ impl StudyPlan {
         check_below("seed", self.seeds.end - 1, LIMIT)?;
         if self.tasks.is_empty() || self.methods.is_empty() {
             return Err(Error::Config("a study needs at least one task and one method".into()));
+        }
+        for (what, names) in [("task", &self.tasks), ("method", &self.methods)] {
+            if let Some(twice) =
+                names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name))
+            {
+                return Err(Error::Config(format!("the {what} `{twice}` is named twice; name it once")));
+            }
         }
         let mut runs = Vec::new();
         for task in &self.tasks {
