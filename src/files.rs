@@ -10,6 +10,7 @@
 
 use std::io::Write;
 use std::path::Path;
+use std::time::Duration;
 
 use crate::error::{Error, Result};
 
@@ -27,10 +28,52 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     Ok(())
 }
 
+/// Removes the temporary files that killed processes have left in a folder, if they are older than `age`: younger ones may be
+/// another process's that is still writing. What cannot be removed stays: it is in nobody's way.
+pub(crate) fn sweep(folder: &Path, age: Duration) {
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let ours = TEMPORARY.iter().any(|prefix| {
+            let rest = name.to_str().and_then(|name| name.strip_prefix(prefix));
+            rest.is_some_and(|rest| rest.len() == 6 && rest.chars().all(|c| c.is_ascii_alphanumeric()))
+        });
+        let since = || Ok::<_, std::io::Error>(entry.metadata()?.modified()?.elapsed().unwrap_or_default());
+        if ours && since().is_ok_and(|since| since >= age) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// What the names of temporary files begin with, now and in the first edition.
+const TEMPORARY: [&str; 2] = [".handful-", ".tmp"];
+
 /// Temporary files are readable by their owner only; ours must have ordinary permissions once they are renamed.
 fn temporary() -> tempfile::Builder<'static, 'static> {
     let mut builder = tempfile::Builder::new();
+    builder.prefix(TEMPORARY[0]);
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     builder
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_kill_left_behind_is_swept() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let here = folder.path();
+        let killed = temporary().tempfile_in(here).expect("a file").into_temp_path().keep().expect("a file");
+        let first_edition = here.join(".tmpa1B2c3");
+        let others = [".tmpfile", ".tmp-a1B2c3", "table.csv"].map(|name| here.join(name));
+        for file in others.iter().chain([&first_edition]) {
+            std::fs::write(file, "").expect("a writable folder");
+        }
+        sweep(here, Duration::from_secs(3600));
+        assert!(killed.exists() && first_edition.exists(), "they may be in use");
+        sweep(here, Duration::ZERO);
+        assert!(!killed.exists() && !first_edition.exists());
+        assert!(others.iter().all(|file| file.exists()));
+    }
 }

@@ -63,12 +63,12 @@ impl Agent for Random {
 impl Checkpoint for Random {
     fn training_state(&self) -> Weights {
         let mut state = Weights::default();
-        state.insert_counts("rng", &rng::state(&self.rng));
+        state.insert_rng("rng", &self.rng);
         state
     }
 
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        self.rng = rng::from_state(&state.counts("rng", 4)?);
+        self.rng = state.rng("rng")?;
         Ok(())
     }
 }

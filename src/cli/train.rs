@@ -5,10 +5,10 @@ use std::sync::atomic::AtomicBool;
 
 use super::progress::Progress;
 use crate::error::{Error, Result};
-use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
+use crate::study::run::is_complete;
+use crate::study::runner;
 use crate::study::starts::Starts;
-use crate::study::{run, runner};
 
 #[derive(clap::Args)]
 pub(super) struct Args {
@@ -40,7 +40,7 @@ pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<
     let mut config = registry.config(&task, &method, seed, steps, config.as_deref())?;
     config.starts = starts.unwrap_or(config.starts);
     let folder = out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{method}-seed{seed}")));
-    if run::is_complete(&folder) && RunConfig::read(&folder.join("config.toml"))? == config {
+    if is_complete(&folder, &config) {
         println!("this run is complete: {}", folder.display());
         return print_test(&folder);
     }

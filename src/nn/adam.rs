@@ -155,9 +155,9 @@ impl Adam {
     /// Reads the state that [`Adam::save`] wrote for an optimiser of `module`.
     ///
     /// # Errors
-    /// If a part is missing or has another size.
+    /// If a part is missing or has another size, or the number of steps cannot be.
     pub fn load(&mut self, weights: &Weights, prefix: &str, module: &impl Parameters) -> Result<()> {
-        self.steps = weights.get(&format!("{prefix}.steps"), [1, 1, 1])?[0] as u32;
+        self.steps = weights.get_within(&format!("{prefix}.steps"), [1, 1, 1], 0.0..=1e9)?[0] as u32;
         self.moments.clear();
         if self.steps > 0 {
             for (name, parameter) in module.parameters() {

@@ -35,3 +35,19 @@ mod transition;
 pub use episode::Episode;
 pub use sequence::{SequenceBatch, SequenceReplay};
 pub use transition::{Batch, ReplayBuffer, Row, Transition};
+
+use crate::checkpoint::Weights;
+use crate::error::{Error, Result};
+
+/// The number of saved rows under a name.
+///
+/// # Errors
+/// If there are none of that name, or more than fit into a buffer of this capacity.
+fn fitting(weights: &Weights, name: &str, capacity: usize) -> Result<usize> {
+    match weights.shape(name)? {
+        [_, count, _] if count > capacity => {
+            Err(Error::Config(format!("`{name}` has {count} rows; they do not fit into a replay buffer of {capacity}")))
+        }
+        [_, count, _] => Ok(count),
+    }
+}

@@ -2,8 +2,8 @@
 
 use rand::RngExt;
 
-use super::Transition;
-use crate::checkpoint::Weights;
+use super::{Transition, fitting};
+use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
 use crate::rng::Rng;
 
@@ -161,6 +161,11 @@ impl SequenceReplay {
         batch
     }
 
+    /// The most steps that may have been added, from the time steps held.
+    pub(crate) fn most_pushes(&self) -> u64 {
+        if self.len() < self.capacity { self.len() as u64 } else { MAX_COUNT }
+    }
+
     /// Writes the buffer into `weights`, under `prefix`.
     pub fn save(&self, weights: &mut Weights, prefix: &str) {
         weights.insert(format!("{prefix}.rows"), self.rows.clone(), [1, self.len(), self.width()]);
@@ -170,12 +175,14 @@ impl SequenceReplay {
     /// Reads what [`SequenceReplay::save`] wrote; the current episode is not continued.
     ///
     /// # Errors
-    /// If it is missing, or of time steps of other sizes.
+    /// If it is missing, of time steps of other sizes, or of more of them than fit.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let name = format!("{prefix}.rows");
-        let [_, count, _] = weights.shape(&name)?;
+        let count = fitting(weights, &name, self.capacity)?;
         let rows = weights.get(&name, [1, count, self.width()])?.to_vec();
-        self.oldest = weights.counts(&format!("{prefix}.oldest"), 1)?[0] as usize;
+        // Time steps are overwritten once the buffer is full.
+        let newest = if count < self.capacity { 0 } else { count - 1 };
+        self.oldest = weights.count(&format!("{prefix}.oldest"), 0..=newest as u64)? as usize;
         self.rows = rows;
         self.arrival_reward = None;
         Ok(())

@@ -1,9 +1,12 @@
 //! Single transitions in a ring buffer, sampled uniformly: what SAC and PETS learn from.
 
+use std::ops::RangeInclusive;
+
 use rand::RngExt;
 
-use crate::checkpoint::Weights;
-use crate::error::{Error, Result};
+use super::fitting;
+use crate::checkpoint::{MAX_COUNT, Weights};
+use crate::error::Result;
 use crate::rng::Rng;
 
 /// One step of experience in any environment.
@@ -152,6 +155,12 @@ impl ReplayBuffer {
         batch
     }
 
+    /// How many transitions may have been added, from those held.
+    pub(crate) fn pushes(&self) -> RangeInclusive<u64> {
+        let held = self.len() as u64;
+        held..=if self.len() < self.capacity { held } else { MAX_COUNT }
+    }
+
     /// Writes the buffer into `weights`, under `prefix`.
     pub fn save(&self, weights: &mut Weights, prefix: &str) {
         weights.insert(format!("{prefix}.rows"), self.rows.clone(), [1, self.len(), self.width()]);
@@ -165,20 +174,17 @@ impl ReplayBuffer {
     /// If it is missing, has transitions of other sizes, or more of them than fit.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let name = format!("{prefix}.rows");
-        let [_, count, _] = weights.shape(&name)?;
-        if count > self.capacity {
-            return Err(Error::Config(format!(
-                "{count} saved transitions do not fit into a replay buffer of {}",
-                self.capacity
-            )));
-        }
+        let count = fitting(weights, &name, self.capacity)?;
         let rows = weights.get(&name, [1, count, self.width()])?.to_vec();
-        let next = weights.counts(&format!("{prefix}.next"), 1)?[0];
+        let next = weights.count(&format!("{prefix}.next"), 0..=count as u64)?;
+        let pushed = format!("{prefix}.pushed");
         self.pushed = if count < self.capacity {
             count as u64
+        } else if weights.has_counts(&pushed) {
+            weights.count(&pushed, count as u64..=MAX_COUNT)?
         } else {
             // Older checkpoints do not say how often the ring was filled; any number tells its order.
-            weights.counts(&format!("{prefix}.pushed"), 1).map_or(count as u64 + next, |pushed| pushed[0])
+            count as u64 + next
         };
         self.rows = rows;
         Ok(())

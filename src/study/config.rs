@@ -78,21 +78,28 @@ impl RunConfig {
     /// If there is none, or it is not one of ours.
     pub fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
-        let mut table: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+        let table: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
         // Files of earlier versions do not tell how many values they have.
-        if let Some(count) = table.remove(VALUES)
-            && (count != Value::Integer(count_values(&table)) || !text.ends_with('\n'))
-        {
-            return Err(Error::Config(format!(
-                "{}: {} values are left of {count}; restore the file, or remove the run",
-                path.display(),
-                count_values(&table)
-            )));
+        if let Some(count) = table.get(VALUES) {
+            let left = count_values(&table) - 1;
+            if *count != Value::Integer(left) || !text.ends_with('\n') {
+                return Err(Error::Config(format!(
+                    "{}: {left} values are left of {count}; restore the file, or remove the run",
+                    path.display()
+                )));
+            }
         }
-        upgrade_keys(&mut table);
-        let config = Self::from_table(table).map_err(|problem| bad_config(path, &problem))?;
+        let config = Self::from_toml(&text).map_err(|problem| bad_config(path, &problem))?;
         config.check().map_err(|problem| Error::Config(format!("{}: {problem}", path.display())))?;
         Ok(config)
+    }
+
+    /// From the text of `config.toml`, whole or not.
+    pub(super) fn from_toml(text: &str) -> Result<Self, toml::de::Error> {
+        let mut table: Table = toml::from_str(text)?;
+        table.remove(VALUES);
+        upgrade_keys(&mut table);
+        Self::from_table(table)
     }
 
     /// From the table that [`RunConfig::to_table`] makes.

@@ -41,6 +41,7 @@ pub mod config;
 pub mod evaluate;
 #[cfg(feature = "study")]
 pub mod figures;
+mod folder;
 mod names;
 pub mod records;
 pub mod registry;

@@ -22,6 +22,10 @@ const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90"
 const VALUE_COLUMNS: [&str; 5] = ["step", "expected", "realised", "rmse", "correlation"];
 const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
 
+/// The files that a complete run has.
+pub(super) const TABLES: [&str; 6] =
+    ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"];
+
 /// A row of `episodes.csv`: one training episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeRow {
@@ -148,13 +152,9 @@ impl Progress {
     /// If one cannot be written.
     pub(super) fn write_tables(&self, folder: &Path) -> Result<()> {
         let Self { episodes, evaluations, losses, model, values, .. } = self;
-        if !model.is_empty() {
-            let rows = model.iter().map(|row| (row.step, &row.open_loop));
-            write_csv(&folder.join("model.csv"), &MODEL_COLUMNS, rows)?;
-        }
-        if !values.is_empty() {
-            write_csv(&folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
-        }
+        let predictions = model.iter().map(|row| (row.step, &row.open_loop));
+        write_csv(&folder.join("model.csv"), &MODEL_COLUMNS, predictions)?;
+        write_csv(&folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
         write_csv(&folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
         // Without the interval of the success rate, which follows from the rate and the episodes.
         let evaluations = evaluations.iter().map(|EvaluationRow { step, summary: s }| {

@@ -2,12 +2,16 @@
 
 use std::fmt::Write;
 use std::path::Path;
+use std::time::Duration;
 
 use super::figures;
 use super::starts::Starts;
 use super::tables::{BASELINE, Curve, LEVEL, Tables};
 use crate::error::Result;
 use crate::files;
+
+/// A temporary file that is older than this is nobody's any more.
+const ABANDONED: Duration = Duration::from_secs(3600);
 
 /// Reads a study's tables from the folder `from`, and writes `summary.csv`, the figures and `report.md` into the folder
 /// `to`. Returns the table of results as text.
@@ -16,6 +20,7 @@ use crate::files;
 /// If a table is missing or damaged, or if a file cannot be written.
 pub fn write(from: &Path, to: &Path) -> Result<String> {
     let tables = Tables::read(from)?;
+    files::sweep(to, ABANDONED);
     tables.write_summary(to)?;
     let pairs = tables.tasks_and_methods()?;
     let mut tasks: Vec<&str> = Vec::new();

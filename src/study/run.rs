@@ -1,9 +1,10 @@
 //! One run: a method learns a task, is evaluated on the way and tested at the end; all of it in a folder that survives
 //! crashes and can be resumed.
 //!
-//! The folder holds `config.toml`, the tables of [`records`], `weights.safetensors`, and
+//! The folder holds `config.toml`, the tables of [`records`](super::records), `weights.safetensors`, and
 //! `checkpoint/state.safetensors`, the one file that a resumed run starts from. Every file is written under a temporary
-//! name and renamed.
+//! name and renamed; checkpoint and weights know whose they are, and have a checksum. One process at a time has the folder
+//! open.
 //!
 //! ```
 //! use handful::prelude::*;
@@ -20,19 +21,20 @@
 //! # Ok::<(), Error>(())
 //! ```
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Evaluator};
-use super::records::{self, EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
+use super::folder::RunFolder;
+pub use super::folder::is_complete;
+use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
 use crate::agent::{Method, Mode};
 use crate::checkpoint::Weights;
 use crate::env::Env;
 use crate::env::contract::Checked;
 use crate::error::{Error, Result};
-use crate::files;
 use crate::replay::Transition;
 
 /// A checkpoint is due after this long.
@@ -56,7 +58,7 @@ pub enum Event {
 /// A run in progress. Its owner decides when to step, to save, and to stop.
 pub struct Run<E> {
     config: RunConfig,
-    folder: PathBuf,
+    folder: RunFolder,
     env: Checked<E>,
     evaluator: Evaluator<E>,
     method: Method,
@@ -71,9 +73,9 @@ pub struct Run<E> {
 
 impl<E> std::fmt::Debug for Run<E> {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
-        let Self { config, folder, progress, .. } = self;
+        let Self { config, progress, .. } = self;
         let mut run = f.debug_struct("Run");
-        run.field("config", config).field("folder", folder).field("step", &progress.step).finish_non_exhaustive()
+        run.field("config", config).field("step", &progress.step).finish_non_exhaustive()
     }
 }
 
@@ -81,7 +83,8 @@ impl<E: Env> Run<E> {
     /// Starts a run of a method in `folder`, in environments that `make` makes; or resumes the one that is there.
     ///
     /// # Errors
-    /// If the folder holds a run with other settings, a damaged checkpoint, or cannot be written.
+    /// If the folder holds a run with other settings, another run's checkpoint or a damaged one, another process (or this
+    /// one) has it open, or it cannot be written.
     pub fn open(
         config: RunConfig,
         mut method: Method,
@@ -91,20 +94,8 @@ impl<E: Env> Run<E> {
         config.check()?;
         // Whatever is wrong with the environment shows before anything is written.
         let (env, evaluator) = (Checked::new(make()?), Evaluator::new(make)?);
-        let config_path = folder.join("config.toml");
-        if config_path.exists() {
-            let there = RunConfig::read(&config_path)?;
-            if let Some(difference) = difference(&there, &config) {
-                return Err(Error::Config(format!(
-                    "{}: this folder holds another run ({difference}); choose another --out, or remove it",
-                    config_path.display()
-                )));
-            }
-        } else {
-            files::write(&config_path, config.to_toml().as_bytes())?;
-        }
-        let checkpoint = folder.join("checkpoint").join("state.safetensors");
-        let progress = if checkpoint.exists() { load(&checkpoint, &mut method)? } else { Progress::default() };
+        let folder = RunFolder::claim(folder, &config)?;
+        let progress = folder.load(&config, &mut method)?.unwrap_or_default();
         let mut run = Self {
             env,
             evaluator,
@@ -114,7 +105,7 @@ impl<E: Env> Run<E> {
             episode_length: 0,
             evaluated_at: progress.evaluations.last().map(|row| row.step),
             progress,
-            folder: folder.into(),
+            folder,
             clock: Instant::now(),
             last_save: Instant::now(),
             config,
@@ -231,9 +222,7 @@ impl<E: Env> Run<E> {
         if !complete {
             return Ok(Event::Testing(test.results.len()));
         }
-        records::write_test(&self.folder, test)?;
-        let summary = toml::to_string(&test.summary()).expect("a summary is TOML");
-        files::write(&self.folder.join("summary.toml"), summary.as_bytes())?;
+        self.folder.complete(test)?;
         Ok(Event::Tested(test.clone()))
     }
 
@@ -246,17 +235,10 @@ impl<E: Env> Run<E> {
         self.progress.seconds += self.clock.elapsed().as_secs_f64();
         self.clock = Instant::now();
         self.last_save = self.clock;
-        let weights = self.method.checkpoint().weights();
+        let checkpoint = self.method.checkpoint();
+        let weights = checkpoint.weights();
         check_weights(&weights, self.progress.step)?;
-        let mut state = self.method.checkpoint().training_state();
-        state.absorb("weights.", &weights);
-        // TOML, since JSON has no word for a likelihood or a loss that is not a number.
-        state.set_note("progress", toml::to_string(&self.progress).expect("progress is TOML"));
-        state.write(&self.folder.join("checkpoint").join("state.safetensors"))?;
-        if self.config.learns() {
-            weights.write(&self.folder.join("weights.safetensors"))?;
-        }
-        self.progress.write_tables(&self.folder)
+        self.folder.save(&self.config, weights, checkpoint.training_state(), &self.progress)
     }
 }
 
@@ -266,45 +248,6 @@ fn check_weights(weights: &Weights, step: usize) -> Result<()> {
     match weights.with_nan() {
         Some(name) => Err(Error::Diverged { what: format!("a weight of `{name}`"), step }),
         None => Ok(()),
-    }
-}
-
-/// Whether the run in `folder` is complete.
-pub fn is_complete(folder: &Path) -> bool {
-    folder.join("summary.toml").exists()
-}
-
-fn load(path: &Path, method: &mut Method) -> Result<Progress> {
-    let foreign = |problem: Error| {
-        let advice = format!("not a checkpoint of this run ({problem}); remove it to start anew");
-        Error::checkpoint(path, advice, Some(problem.into()))
-    };
-    let state = Weights::read(path)?;
-    let progress = state.note("progress").ok_or_else(|| foreign(Error::Config("it tells no progress".into())))?;
-    let progress = toml::from_str(progress)
-        .map_err(|problem| foreign(Error::Config(format!("its progress: {}", problem.message()))))?;
-    let checkpoint = method.checkpoint_mut();
-    checkpoint.load_weights(&state.extract("weights.")).map_err(foreign)?;
-    checkpoint.load_training_state(&state).map_err(foreign)?;
-    Ok(progress)
-}
-
-/// The first setting in which two configurations differ.
-fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
-    difference_in("", &there.to_table(), &wanted.to_table())
-}
-
-fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
-    let key = there.keys().chain(wanted.keys()).find(|key| there.get(*key) != wanted.get(*key))?;
-    let name = format!("{path}{key}");
-    match (there.get(key), wanted.get(key)) {
-        (Some(toml::Value::Table(there)), Some(toml::Value::Table(wanted))) => {
-            difference_in(&format!("{name}."), there, wanted)
-        }
-        (there, wanted) => {
-            let show = |value: Option<&toml::Value>| value.map_or("nothing".into(), ToString::to_string);
-            Some(format!("its `{name}` is {}, not {}", show(there), show(wanted)))
-        }
     }
 }
 
@@ -337,6 +280,7 @@ mod tests {
         run.progress.losses.push(loss);
         run.progress.model.push(model.clone());
         run.save().expect("a writable folder");
+        drop(run);
         let again = registry.open_run(&config, folder.path()).expect("a run to go on with").progress;
         assert!(again.losses[0].value.is_nan());
         assert_eq!(again.model, [model]);

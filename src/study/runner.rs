@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use super::config::RunConfig;
 use super::registry::Registry;
-use super::run::{self, Event};
+use super::run::{Event, is_complete};
 use super::starts::{LIMIT, check_below};
 use crate::error::{Error, Result};
 
@@ -157,9 +157,7 @@ pub fn carry_out_all(
                     .build()
                     .expect("threads for a run");
                 while let Some((config, folder)) = runs.get(next.fetch_add(1, Ordering::SeqCst)) {
-                    if run::is_complete(folder)
-                        && RunConfig::read(&folder.join("config.toml")).is_ok_and(|c| c == *config)
-                    {
+                    if is_complete(folder, config) {
                         continue;
                     }
                     let index = runs.iter().position(|(_, other)| other == folder).expect("a run of this study");

@@ -40,7 +40,7 @@ use super::warm_up::RandomActions;
 use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots, ValueEstimate};
 use crate::checkpoint::Weights;
 use crate::env::Spec;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::model::WorldModel;
 use crate::model::open_loop::{OpenLoop, open_loop};
 use crate::nn::{Adam, AdamConfig};
@@ -238,24 +238,25 @@ impl Checkpoint for Dreamer {
         let [low, high] = self.scale.range();
         state.insert("progress", vec![low, high, self.update_credit], [1, 1, 3]);
         state.insert_counts("counts", &[self.observed as u64]);
-        state.insert_counts("rng", &rng::state(&self.rng));
-        state.insert_counts("mind rng", &rng::state(&self.policy_state.rng));
+        state.insert_rng("rng", &self.rng);
+        state.insert_rng("mind rng", &self.policy_state.rng);
         state
     }
 
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        let counts = state.counts("counts", 1)?;
-        let (own, policy_state) = (state.counts("rng", 4)?, state.counts("mind rng", 4)?);
+        let (own, policy_state) = (state.rng("rng")?, state.rng("mind rng")?);
         let &[low, high, update_credit] = state.get("progress", [1, 1, 3])? else { unreachable!("three numbers") };
+        if !(0.0..1.0).contains(&update_credit) {
+            return Err(Error::Config(format!("the credit of updates is {update_credit}; it must lie in 0..1")));
+        }
         state.load_module("slow", &mut self.networks.target)?;
         self.optimiser.load(state, "optimiser", &self.networks)?;
         self.replay.load(state, "replay")?;
-        self.observed = counts[0] as usize;
+        self.observed = state.count("counts", 0..=self.replay.most_pushes())? as usize;
         self.scale = ReturnScale::from_range(low, high);
         self.update_credit = update_credit;
-        self.rng = rng::from_state(&own);
-        self.policy_state =
-            PolicyState::new(&self.networks.world, &self.config, self.spec.action_size, rng::from_state(&policy_state));
+        self.rng = own;
+        self.policy_state = PolicyState::new(&self.networks.world, &self.config, self.spec.action_size, policy_state);
         self.random.reset();
         self.noise.reset();
         Ok(())

@@ -32,19 +32,18 @@ impl Checkpoint for Pets {
         self.ensemble.save_training_state(&mut state);
         self.replay.save(&mut state, "replay");
         state.insert_counts("counts", &[self.observed as u64]);
-        state.insert_counts("rng", &rng::state(&self.rng));
-        state.insert_counts("planner rng", &rng::state(&self.controller.rng));
+        state.insert_rng("rng", &self.rng);
+        state.insert_rng("planner rng", &self.controller.rng);
         state
     }
 
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        let counts = state.counts("counts", 1)?;
-        let (own, planner) = (state.counts("rng", 4)?, state.counts("planner rng", 4)?);
+        let (own, planner) = (state.rng("rng")?, state.rng("planner rng")?);
         self.ensemble.load_training_state(state)?;
         self.replay.load(state, "replay")?;
-        self.observed = counts[0] as usize;
-        self.rng = rng::from_state(&own);
-        self.controller = self.controllers.make(rng::from_state(&planner));
+        self.observed = state.count("counts", self.replay.pushes())? as usize;
+        self.rng = own;
+        self.controller = self.controllers.make(planner);
         self.random.reset();
         Ok(())
     }

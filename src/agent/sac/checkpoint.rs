@@ -5,11 +5,10 @@ use dfdx::prelude::*;
 use super::Sac;
 use super::temperature::Temperature;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
-use crate::checkpoint::Weights;
+use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
 use crate::nn::{Grad, ops, tensor};
 use crate::replay::Episode;
-use crate::rng;
 
 impl Diagnostics for Sac {
     fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
@@ -50,21 +49,23 @@ impl Checkpoint for Sac {
         self.critic_optimiser.save(&mut state, "critics");
         self.replay.save(&mut state, "replay");
         state.insert_counts("counts", &[self.observed as u64, self.updates as u64]);
-        state.insert_counts("rng", &rng::state(&self.rng));
+        state.insert_rng("rng", &self.rng);
         let Temperature { moments: [first, second], steps, .. } = self.temperature;
         state.insert("temperature", vec![first, second, steps as f32], [1, 1, 3]);
         state
     }
 
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        let counts = state.counts("counts", 2)?;
-        let rng = rng::from_state(&state.counts("rng", 4)?);
-        let temperature = state.get("temperature", [1, 1, 3])?;
+        let rng = state.rng("rng")?;
+        let &[first, second, steps] = state.get_within("temperature", [1, 1, 3], -1e9..=1e9)? else {
+            unreachable!("three numbers")
+        };
         self.policy_optimiser.load(state, "policy", &self.policy)?;
         self.critic_optimiser.load(state, "critics", &self.critics)?;
         self.replay.load(state, "replay")?;
-        self.temperature.moments = [temperature[0], temperature[1]];
-        self.temperature.steps = temperature[2] as i32;
+        let counts = state.counts_within("counts", &[self.replay.pushes(), 0..=MAX_COUNT])?;
+        self.temperature.moments = [first, second];
+        self.temperature.steps = steps.max(0.0) as i32;
         self.observed = counts[0] as usize;
         self.updates = counts[1] as usize;
         self.rng = rng;

@@ -49,9 +49,10 @@ pub use fit::Fit;
 
 use self::fit::{Learner, Member};
 use super::{Dynamics, FeatureMap, Normaliser};
+use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::env::Spec;
 use crate::error::Result;
-use crate::nn::{Activation, Adam, AdamConfig, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, Weights, device};
+use crate::nn::{Activation, Adam, AdamConfig, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, device};
 use crate::rng::Rng;
 use crate::settings::Ranges;
 
@@ -156,11 +157,13 @@ impl Ensemble {
     /// Loads what [`Ensemble::weights`] returned.
     ///
     /// # Errors
-    /// If an array is missing or has another shape, as with other settings.
+    /// If an array is missing or has another shape, as with other settings, or a number is none that was saved.
     pub fn load_weights(&mut self, weights: &Weights) -> Result<()> {
-        let elites = weights.counts("elites", self.config.elites)?;
-        let temperature = weights.get("temperature", [1, 1, self.temperature.len()])?.to_vec();
-        self.fits = weights.counts("fits", 1)?[0] as usize;
+        let last = self.config.members as u64 - 1;
+        let elites = weights.counts_within("elites", &vec![0..=last; self.config.elites])?;
+        let temperature =
+            weights.get_within("temperature", [1, 1, self.temperature.len()], f32::MIN_POSITIVE..=f32::MAX)?.to_vec();
+        self.fits = weights.count("fits", 0..=MAX_COUNT)? as usize;
         for (i, member) in self.members.iter_mut().enumerate() {
             weights.load_module(&member_name(i), &mut member.learner)?;
         }

@@ -68,11 +68,11 @@ impl Normaliser {
     /// Loads what [`Normaliser::save`] stored.
     ///
     /// # Errors
-    /// If an array is missing or has another number of features; the normaliser is unchanged then.
+    /// If an array is missing or has another number of features, or a scale is not positive; the normaliser is unchanged then.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let size = [1, 1, self.mean.len()];
         let mean = weights.get(&format!("{prefix}.mean"), size)?.to_vec();
-        let scale = weights.get(&format!("{prefix}.scale"), size)?.to_vec();
+        let scale = weights.get_within(&format!("{prefix}.scale"), size, f32::MIN_POSITIVE..=f32::MAX)?.to_vec();
         *self = Self { mean, scale };
         Ok(())
     }

@@ -30,10 +30,10 @@ use envs::ErasedEnv;
 pub use envs::{EnvEntry, NoOptions, Settings};
 
 use super::config::{RunConfig, bad_config, upgrade_keys};
+use super::folder::{load_weights, read_config};
 use super::run::Run;
 use super::starts::{LIMIT, check_below};
 use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, preset_table, specialise};
-use crate::checkpoint::Weights;
 use crate::env::Env;
 use crate::error::{Error, Result};
 use crate::rng;
@@ -239,19 +239,14 @@ impl Registry {
     /// The method of the run in `folder`, with what it has learned.
     ///
     /// # Errors
-    /// If there is no run, or its weights are missing or damaged.
+    /// If there is no run, or its weights are missing, damaged, or another run's.
     pub fn trained_method(&self, folder: &Path) -> Result<(RunConfig, Method)> {
-        let path = folder.join("config.toml");
-        let mut config = RunConfig::read(&path)?;
+        let (path, mut config) = read_config(folder)?;
+        let as_read = config.clone();
         self.complete(&mut config).map_err(|problem| bad_config(&path, &problem))??;
         let mut method = self.method(&config)?;
         if config.learns() {
-            let path = folder.join("weights.safetensors");
-            let weights = Weights::read(&path)?;
-            method
-                .checkpoint_mut()
-                .load_weights(&weights)
-                .map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))?;
+            load_weights(folder, &as_read, &mut method)?;
         }
         Ok((config, method))
     }

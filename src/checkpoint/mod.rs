@@ -1,7 +1,8 @@
 //! Checkpoints: named arrays in safetensors files, written so that a crash never leaves half a file.
 //!
 //! A checkpoint holds f32 arrays (weights, optimiser moments, replayed experience), u64 arrays (step counts, the states of
-//! random number generators), and notes in the file's metadata.
+//! random number generators), and notes. The file's metadata have the notes and a checksum of everything in the file, so that
+//! damage is found when it is read.
 //!
 //! ```
 //! use handful::checkpoint::Weights;
@@ -10,24 +11,29 @@
 //! let generator = rng::stream(0, "example");
 //! let mut saved = Weights::default();
 //! saved.insert("policy.0.bias", vec![0.5, -0.5], [1, 1, 2]);
-//! saved.insert_counts("rng", &rng::state(&generator));
+//! saved.insert_rng("rng", &generator);
+//! saved.insert_counts("steps", &[1000]);
 //!
 //! let folder = tempfile::tempdir()?;
 //! let path = folder.path().join("state.safetensors");
 //! saved.write(&path)?;
 //! let read = Weights::read(&path)?;
 //! assert_eq!(read.get("policy.0.bias", [1, 1, 2])?, [0.5, -0.5]);
-//! assert_eq!(rng::from_state(&read.counts("rng", 4)?), generator);
+//! assert_eq!(read.rng("rng")?, generator);
+//! assert_eq!(read.count("steps", 0..=2000)?, 1000);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-use std::collections::BTreeMap;
-use std::path::Path;
+mod file;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 
 use crate::error::{Error, Result};
-use crate::files;
+use crate::rng::{self, Rng};
+
+/// No number of steps, updates or the like in a checkpoint is larger, so that adding a few of them never overflows.
+pub const MAX_COUNT: u64 = 1 << 48;
 
 /// The contents of a checkpoint: named f32 arrays of three dimensions, named lists of whole numbers, and named notes.
 ///
@@ -105,6 +111,60 @@ impl Weights {
         }
     }
 
+    /// Whether there are whole numbers of that name.
+    pub fn has_counts(&self, name: &str) -> bool {
+        self.counts.contains_key(name)
+    }
+
+    /// As many whole numbers as there are ranges, each in its range.
+    ///
+    /// # Errors
+    /// As [`Weights::counts`], and if a number lies outside.
+    pub fn counts_within(&self, name: &str, ranges: &[RangeInclusive<u64>]) -> Result<Vec<u64>> {
+        let counts = self.counts(name, ranges.len())?;
+        match counts.iter().zip(ranges).find(|(count, range)| !range.contains(count)) {
+            None => Ok(counts),
+            Some((count, range)) => Err(outside(name, count, range)),
+        }
+    }
+
+    /// One whole number that lies in `range`.
+    ///
+    /// # Errors
+    /// As [`Weights::counts_within`].
+    pub fn count(&self, name: &str, range: RangeInclusive<u64>) -> Result<u64> {
+        Ok(self.counts_within(name, &[range])?[0])
+    }
+
+    /// The array of that name and shape, all of whose numbers lie in `range`.
+    ///
+    /// # Errors
+    /// As [`Weights::get`], and if a number lies outside.
+    pub fn get_within(&self, name: &str, shape: [usize; 3], range: RangeInclusive<f32>) -> Result<&[f32]> {
+        let numbers = self.get(name, shape)?;
+        match numbers.iter().find(|number| !range.contains(number)) {
+            None => Ok(numbers),
+            Some(number) => Err(outside(name, number, &range)),
+        }
+    }
+
+    /// Adds the state of a random number generator.
+    pub fn insert_rng(&mut self, name: impl Into<String>, rng: &Rng) {
+        self.insert_counts(name, &rng::state(rng));
+    }
+
+    /// A generator that continues from the state saved with [`Weights::insert_rng`].
+    ///
+    /// # Errors
+    /// If there is none, or it is zero, which no generator ever is.
+    pub fn rng(&self, name: &str) -> Result<Rng> {
+        let state = self.counts(name, 4)?;
+        if state == [0; 4] {
+            return Err(Error::Config(format!("`{name}` is zero, which is no state of a generator")));
+        }
+        Ok(rng::from_state(&state))
+    }
+
     /// Adds all arrays and whole numbers of `other`, with `prefix` before their names. Notes stay behind.
     pub fn absorb(&mut self, prefix: &str, other: &Self) {
         self.arrays.extend(other.arrays.iter().map(|(name, array)| (format!("{prefix}{name}"), array.clone())));
@@ -129,76 +189,32 @@ impl Weights {
     pub fn note(&self, name: &str) -> Option<&str> {
         self.notes.get(name).map(String::as_str)
     }
+}
 
-    /// Writes a safetensors file; an existing one is replaced at once or not at all.
-    ///
-    /// # Errors
-    /// If the file cannot be written.
-    pub fn write(&self, path: &Path) -> Result<()> {
-        let arrays = self.arrays.iter().map(|(name, (numbers, shape))| {
-            let view = TensorView::new(Dtype::F32, shape.to_vec(), bytemuck::cast_slice(numbers));
-            (name, view.expect("shapes were checked when the array came in"))
-        });
-        let counts = self.counts.iter().map(|(name, counts)| {
-            let view = TensorView::new(Dtype::U64, vec![counts.len()], bytemuck::cast_slice(counts));
-            (name, view.expect("one number each"))
-        });
-        let bytes = safetensors::serialize(arrays.chain(counts), Some(self.notes.clone().into_iter().collect()))
-            .map_err(|problem| {
-                Error::checkpoint(path, format!("cannot be composed: {problem}"), Some(problem.into()))
-            })?;
-        files::write(path, &bytes)
-    }
-
-    /// Reads a safetensors file.
-    ///
-    /// # Errors
-    /// If it cannot be read, is damaged, or holds anything but f32 arrays of three dimensions and u64 arrays of one.
-    pub fn read(path: &Path) -> Result<Self> {
-        let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
-        let damaged = |problem: safetensors::SafeTensorError| {
-            let advice = format!("damaged, or no safetensors file ({problem}); restore it or start the run anew");
-            Error::checkpoint(path, advice, Some(problem.into()))
-        };
-        let file = SafeTensors::deserialize(&bytes).map_err(damaged)?;
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
-        let notes = header.metadata().clone().unwrap_or_default().into_iter().collect();
-        let mut weights = Self { notes, ..Self::default() };
-        for (name, view) in file.tensors() {
-            match (view.dtype(), view.shape()) {
-                (Dtype::F32, &[members, rows, columns]) => {
-                    weights.insert(name, bytemuck::pod_collect_to_vec(view.data()), [members, rows, columns]);
-                }
-                (Dtype::U64, &[_]) => {
-                    weights.counts.insert(name, bytemuck::pod_collect_to_vec(view.data()));
-                }
-                _ => {
-                    let advice = format!("`{name}` is not one of our arrays; is this file from another program?");
-                    return Err(Error::checkpoint(path, advice, None));
-                }
-            }
-        }
-        Ok(weights)
-    }
+fn outside<T: std::fmt::Debug>(name: &str, value: &T, range: &RangeInclusive<T>) -> Error {
+    Error::Config(format!("`{name}` is {value:?}; it must lie in {range:?}"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// As the first version wrote it, through a file.
     #[test]
-    fn whole_numbers_of_old_checkpoints_are_read() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("state.safetensors");
-        let counts = [u64::MAX, 0, 123_456_789_012_345];
-        let parts = counts.iter().flat_map(|count| [0, 16, 32, 48].map(|shift| ((count >> shift) & 0xffff) as f32));
-        let mut old = Weights::default();
-        old.insert("agent.rng", parts.collect(), [1, counts.len(), 4]);
-        old.write(&path).expect("a writable folder");
-        let read = Weights::read(&path).expect("what was just written").extract("agent.");
-        assert_eq!(read.counts("rng", 3).expect("three"), counts);
-        assert!(read.counts("rng", 4).is_err() && read.counts("other", 3).is_err());
+    fn what_is_read_lies_in_its_range() {
+        let mut weights = Weights::default();
+        weights.insert_counts("steps", &[5]);
+        weights.insert_counts("rng", &[0; 4]);
+        weights.insert("scale", vec![1.0, 0.0], [1, 1, 2]);
+        assert_eq!(weights.count("steps", 0..=5).expect("in range"), 5);
+        let problem = weights.count("steps", 0..=4).expect_err("too large").to_string();
+        assert_eq!(problem, "`steps` is 5; it must lie in 0..=4");
+        assert!(weights.rng("rng").is_err());
+        assert!(weights.get_within("scale", [1, 1, 2], 0.0..=1.0).is_ok());
+        let problem = weights.get_within("scale", [1, 1, 2], 0.5..=1.0).expect_err("too small").to_string();
+        assert_eq!(problem, "`scale` is 0.0; it must lie in 0.5..=1.0");
+        // NaN is in no range.
+        weights.insert("scale", vec![f32::NAN], [1, 1, 1]);
+        assert!(weights.get_within("scale", [1, 1, 1], f32::MIN..=f32::MAX).is_err());
     }
 
     #[test]

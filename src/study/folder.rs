@@ -1,0 +1,191 @@
+//! A run's folder: who may write in it, whose run it holds, and what a resumed run starts from.
+
+use std::fs::{File, OpenOptions, TryLockError};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use super::config::{RunConfig, bad_config};
+use super::evaluate::{Evaluation, Summary};
+use super::records::{Progress, TABLES, write_test};
+use crate::agent::Method;
+use crate::checkpoint::Weights;
+use crate::error::{Error, Result};
+use crate::files;
+
+const CONFIG: &str = "config.toml";
+const CHECKPOINT: &str = "checkpoint/state.safetensors";
+const WEIGHTS: &str = "weights.safetensors";
+const SUMMARY: &str = "summary.toml";
+const LOCK: &str = ".lock";
+
+/// The note in a checkpoint, and in weights, that holds the run's configuration.
+const RUN: &str = "run";
+
+/// The folder of a run that is open. It is locked: no other process, and no other [`RunFolder`] in this one, writes there.
+pub(super) struct RunFolder {
+    path: PathBuf,
+    /// The system releases it when the process ends, however it ends.
+    _lock: File,
+}
+
+impl RunFolder {
+    /// Opens the folder for a run, new or begun.
+    ///
+    /// # Errors
+    /// If it is open elsewhere, holds another run, or cannot be written.
+    pub fn claim(path: &Path, config: &RunConfig) -> Result<Self> {
+        let folder = Self { path: path.into(), _lock: lock(path)? };
+        let file = path.join(CONFIG);
+        if file.exists() {
+            if let Some(difference) = difference(&RunConfig::read(&file)?, config) {
+                return Err(Error::Config(format!(
+                    "{}: this folder holds another run ({difference}); choose another --out, or remove it",
+                    file.display()
+                )));
+            }
+        } else {
+            files::write(&file, config.to_toml().as_bytes())?;
+        }
+        for place in [path.to_path_buf(), path.join("checkpoint")] {
+            files::sweep(&place, Duration::ZERO);
+        }
+        Ok(folder)
+    }
+
+    /// Gives the method of this run its saved state, and answers how far the run had come. None if nothing was saved.
+    ///
+    /// # Errors
+    /// If the checkpoint is damaged, or another run's.
+    pub fn load(&self, config: &RunConfig, method: &mut Method) -> Result<Option<Progress>> {
+        let path = self.path.join(CHECKPOINT);
+        if !path.exists() {
+            return Ok(None);
+        }
+        let state = read_own(&path, config)?;
+        let foreign = |problem: Error| {
+            let advice = format!("not a checkpoint of this run ({problem}); remove it to start anew");
+            Error::checkpoint(&path, advice, Some(problem.into()))
+        };
+        let progress = state.note("progress").ok_or_else(|| foreign(Error::Config("it tells no progress".into())))?;
+        let progress = toml::from_str(progress)
+            .map_err(|problem| foreign(Error::Config(format!("its progress: {}", problem.message()))))?;
+        let checkpoint = method.checkpoint_mut();
+        checkpoint.load_weights(&state.extract("weights.")).map_err(foreign)?;
+        checkpoint.load_training_state(&state).map_err(foreign)?;
+        Ok(Some(progress))
+    }
+
+    /// Writes the checkpoint, the weights of a method that learns, and the tables.
+    ///
+    /// # Errors
+    /// If a file cannot be written; what was written before is then still there.
+    pub fn save(
+        &self,
+        config: &RunConfig,
+        mut weights: Weights,
+        mut state: Weights,
+        progress: &Progress,
+    ) -> Result<()> {
+        state.absorb("weights.", &weights);
+        // TOML, since JSON has no word for a likelihood or a loss that is not a number.
+        state.set_note("progress", toml::to_string(progress).expect("progress is TOML"));
+        state.set_note(RUN, config.to_toml());
+        state.write(&self.path.join(CHECKPOINT))?;
+        if config.learns() {
+            weights.set_note(RUN, config.to_toml());
+            weights.write(&self.path.join(WEIGHTS))?;
+        }
+        progress.write_tables(&self.path)
+    }
+
+    /// Writes the results of the test, which complete the run.
+    ///
+    /// # Errors
+    /// If a file cannot be written.
+    pub fn complete(&self, test: &Evaluation) -> Result<()> {
+        write_test(&self.path, test)?;
+        let summary = toml::to_string(&test.summary()).expect("a summary is TOML");
+        files::write(&self.path.join(SUMMARY), summary.as_bytes())
+    }
+}
+
+/// Whether a folder holds this run, complete with its tables and weights. What is lost can be written anew from the
+/// checkpoint, by opening the run; without a checkpoint the run has ended as it is.
+pub fn is_complete(folder: &Path, config: &RunConfig) -> bool {
+    let this_run = RunConfig::read(&folder.join(CONFIG)).is_ok_and(|there| there == *config);
+    let summary = std::fs::read_to_string(folder.join(SUMMARY)).unwrap_or_default();
+    let has = |file: &str| folder.join(file).exists();
+    this_run
+        && toml::from_str::<Summary>(&summary).is_ok()
+        && (!has(CHECKPOINT) || (TABLES.into_iter().all(has) && (has(WEIGHTS) || !config.learns())))
+}
+
+/// The configuration of the run in a folder.
+///
+/// # Errors
+/// If there is none, or it is damaged.
+pub(super) fn read_config(folder: &Path) -> Result<(PathBuf, RunConfig)> {
+    let path = folder.join(CONFIG);
+    let config = RunConfig::read(&path)?;
+    Ok((path, config))
+}
+
+/// What the run in a folder has learned, for its method to act with.
+///
+/// # Errors
+/// If the weights are missing, damaged, or those of another run.
+pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Method) -> Result<()> {
+    let path = folder.join(WEIGHTS);
+    let loaded = method.checkpoint_mut().load_weights(&read_own(&path, config)?);
+    loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))
+}
+
+/// Reads a checkpoint or weights, unless they are another run's. (Those of the first edition do not say whose they are.)
+fn read_own(path: &Path, config: &RunConfig) -> Result<Weights> {
+    let weights = Weights::read(path)?;
+    if let Some(text) = weights.note(RUN) {
+        let theirs = RunConfig::from_toml(text).map_err(|problem| bad_config(path, &problem))?;
+        if let Some(difference) = difference(&theirs, config) {
+            let advice = format!("it belongs to another run ({difference}); put this run's in its place, or remove it");
+            return Err(Error::checkpoint(path, advice, None));
+        }
+    }
+    Ok(weights)
+}
+
+/// # Errors
+/// If another holds the lock, or the folder cannot be written.
+fn lock(folder: &Path) -> Result<File> {
+    std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    let path = folder.join(LOCK);
+    let file = OpenOptions::new().create(true).append(true).open(&path).map_err(Error::io("write", &path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(Error::Config(format!(
+            "{}: this run is being carried out elsewhere; wait until that ends, or choose another --out",
+            folder.display()
+        ))),
+        // Some network file systems have no locks.
+        Err(TryLockError::Error(problem)) if problem.kind() == std::io::ErrorKind::Unsupported => Ok(file),
+        Err(TryLockError::Error(problem)) => Err(Error::io("lock", &path)(problem)),
+    }
+}
+
+/// The first setting in which two configurations differ.
+fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
+    difference_in("", &there.to_table(), &wanted.to_table())
+}
+
+fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
+    let key = there.keys().chain(wanted.keys()).find(|key| there.get(*key) != wanted.get(*key))?;
+    let name = format!("{path}{key}");
+    match (there.get(key), wanted.get(key)) {
+        (Some(toml::Value::Table(there)), Some(toml::Value::Table(wanted))) => {
+            difference_in(&format!("{name}."), there, wanted)
+        }
+        (there, wanted) => {
+            let show = |value: Option<&toml::Value>| value.map_or("nothing".into(), ToString::to_string);
+            Some(format!("its `{name}` is {}, not {}", show(there), show(wanted)))
+        }
+    }
+}
