@@ -37,8 +37,10 @@ use crate::env::contract::Checked;
 use crate::error::{Error, Result};
 use crate::replay::Transition;
 
-/// A checkpoint is due after this long.
-const CHECKPOINT_EVERY: Duration = Duration::from_secs(30);
+/// A checkpoint is due after this many times as long as it takes to write one, so that a crash loses little and writing costs
+/// little; but not before the first of these durations, and at the latest after the second.
+const SAVING_SHARE: u32 = 50;
+const CHECKPOINT_EVERY: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(30)];
 
 /// What happened in a [`Run::step`].
 #[derive(Clone, Debug)]
@@ -69,6 +71,8 @@ pub struct Run<E> {
     evaluated_at: Option<usize>,
     clock: Instant,
     last_save: Instant,
+    /// How long that took.
+    saving: Duration,
 }
 
 impl<E> std::fmt::Debug for Run<E> {
@@ -108,6 +112,7 @@ impl<E: Env> Run<E> {
             folder,
             clock: Instant::now(),
             last_save: Instant::now(),
+            saving: Duration::ZERO,
             config,
         };
         run.start_episode()?;
@@ -180,7 +185,8 @@ impl<E: Env> Run<E> {
         };
         self.progress.episodes.push(row.clone());
         self.start_episode()?;
-        if self.last_save.elapsed() > CHECKPOINT_EVERY {
+        let [soonest, latest] = CHECKPOINT_EVERY;
+        if self.last_save.elapsed() > (SAVING_SHARE * self.saving).clamp(soonest, latest) {
             self.save()?;
         }
         Ok(Event::EpisodeEnded(row))
@@ -234,11 +240,12 @@ impl<E: Env> Run<E> {
     pub fn save(&mut self) -> Result<()> {
         self.progress.seconds += self.clock.elapsed().as_secs_f64();
         self.clock = Instant::now();
-        self.last_save = self.clock;
         let checkpoint = self.method.checkpoint();
         let weights = checkpoint.weights();
         check_weights(&weights, self.progress.step)?;
-        self.folder.save(&self.config, weights, checkpoint.training_state(), &self.progress)
+        self.folder.save(&self.config, weights, checkpoint.training_state(), &self.progress)?;
+        (self.last_save, self.saving) = (Instant::now(), self.clock.elapsed());
+        Ok(())
     }
 }
 

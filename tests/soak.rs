@@ -1,0 +1,171 @@
+//! Runs that are killed at random moments, again and again, end as if nothing had happened.
+//!
+//! `cargo test --test soak -- --ignored --nocapture` kills 200 times, which takes a quarter of an hour; the environment variable
+//! `SOAK_KILLS` sets another number.
+#![cfg(unix)]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use handful::rng;
+use rand::RngExt;
+
+/// A run that takes a few seconds, of each method that learns.
+const SMALL: [(&str, &str, &str); 4] = [
+    ("pendulum", "sac", "steps = 4000\nsac = { hidden = [32, 32], batch = 32, warm_up = 400 }"),
+    (
+        "reach",
+        "pets",
+        "steps = 1500
+         [pets]
+         warm_up = 200
+         ensemble = { hidden = [16], first_steps = 50, steps = 20, check_every = 10 }
+         planner.icem = { horizon = 4, population = 10, elites = 4, iterations = 2 }",
+    ),
+    (
+        "reach",
+        "dreamer",
+        "steps = 2000
+         [dreamer]
+         batch = 2
+         length = 8
+         train_ratio = 1.0
+         warm_up = 200
+         world = { units = 16, layers = 1, rssm = { deter = 16, blocks = 2, hidden = 8, stoch = 4, classes = 4 } }
+         behaviour = { units = 16, layers = 1, horizon = 5 }",
+    ),
+    ("reach", "debug", "steps = 4000"),
+];
+
+const COMMON: &str = "evaluate_every = 500\nevaluation_episodes = 2\ntest_episodes = 50\n";
+
+/// No command takes longer, or it hangs.
+const PATIENCE: Duration = Duration::from_secs(300);
+
+/// A command, and the folder in which it works.
+struct Job {
+    args: Vec<String>,
+    folder: PathBuf,
+}
+
+impl Job {
+    fn start(&self) -> Child {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_handful"));
+        command.args(&self.args).arg("--out").arg(&self.folder);
+        command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the program starts")
+    }
+
+    /// Kills it by one signal after another, each after a random while, until it is done. Returns the signals.
+    fn harassed(&self, longest: Duration, rng: &mut rng::Rng) -> Vec<&'static str> {
+        let mut sent = Vec::new();
+        loop {
+            let child = self.start();
+            let signal = ["-KILL", "-KILL", "-KILL", "-TERM", "-INT", "-HUP"][rng.random_range(0..6)];
+            let until = Instant::now() + longest.mul_f64(rng.random());
+            let (status, said) = outcome(child, Some((signal, until)));
+            assert!(!said.contains("panicked"), "{:?}: {said}", self.args);
+            match status.code() {
+                Some(0) => return sent,
+                // 130: saved and stopped, as it was asked to; no code: killed.
+                Some(130) | None => sent.push(signal),
+                Some(code) => panic!("{:?} ended with exit code {code}: {said}", self.args),
+            }
+        }
+    }
+}
+
+/// How a process ended, and what it said. If it is still there at the given moment, it gets a signal.
+fn outcome(mut child: Child, mut signal: Option<(&str, Instant)>) -> (ExitStatus, String) {
+    let began = Instant::now();
+    while child.try_wait().expect("a process").is_none() {
+        assert!(began.elapsed() < PATIENCE, "a hang");
+        if let Some((name, _)) = signal.take_if(|(_, at)| Instant::now() > *at) {
+            // It may have ended in this very moment.
+            let _ = Command::new("kill").args([name, &child.id().to_string()]).stderr(Stdio::null()).status();
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let output = child.wait_with_output().expect("a process");
+    (output.status, String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+/// All results in a folder and those below: weights, and tables without running times. Checkpoints have times in them.
+fn results(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in fs::read_dir(folder).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        let name = path.file_name().and_then(|name| name.to_str()).expect("a name").to_string();
+        if path.is_dir() {
+            let below = if name == "checkpoint" { BTreeMap::new() } else { results(&path) };
+            found.extend(below.into_iter().map(|(file, bytes)| (Path::new(&name).join(file), bytes)));
+        } else if name.ends_with(".csv") {
+            found.insert(name.into(), without_times(&fs::read_to_string(&path).expect("a table")).into());
+        } else if !["summary.toml", "report.md"].contains(&name.as_str()) {
+            found.insert(name.into(), fs::read(&path).expect("a file"));
+        }
+    }
+    found
+}
+
+fn without_times(table: &str) -> String {
+    let head: Vec<&str> = table.lines().next().unwrap_or_default().split(',').collect();
+    let kept = |line: &str| -> String {
+        let cells = line.split(',').zip(&head).filter(|(_, name)| !["seconds", "action_ms"].contains(name));
+        cells.map(|(cell, _)| cell).collect::<Vec<_>>().join(",") + "\n"
+    };
+    table.lines().map(kept).collect()
+}
+
+#[test]
+#[ignore = "a quarter of an hour"]
+fn killed_runs_end_as_if_nothing_had_happened() {
+    let wanted = std::env::var("SOAK_KILLS").map_or(200, |kills| kills.parse().expect("a number of kills"));
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name);
+    let mut jobs: Vec<Vec<String>> = Vec::new();
+    for (task, method, settings) in SMALL {
+        let config = at(&format!("{method}.toml"));
+        fs::write(&config, format!("{COMMON}{settings}")).expect("a writable folder");
+        let config = config.to_str().expect("text").to_string();
+        jobs.push(["train", "--task", task, "--method", method, "--config", &config].map(String::from).to_vec());
+    }
+    let study = "study --tasks reach,pendulum --methods random,debug --seeds 3 --jobs 2";
+    jobs.push(study.split(' ').map(String::from).collect());
+
+    let whole: Vec<_> = jobs
+        .iter()
+        .map(|args| {
+            let job = Job { args: args.clone(), folder: at("whole") };
+            let began = Instant::now();
+            let (status, said) = outcome(job.start(), None);
+            assert!(status.success(), "{args:?}: {said}");
+            let whole = (results(&job.folder), began.elapsed());
+            fs::remove_dir_all(&job.folder).expect("a writable folder");
+            whole
+        })
+        .collect();
+    let mut signals: BTreeMap<&str, usize> = BTreeMap::new();
+    let (mut rounds, mut rng) = (0, rng::stream(0, "soak"));
+    while signals.values().sum::<usize>() < wanted {
+        for (args, (whole, took)) in jobs.iter().zip(&whole) {
+            let job = Job { args: args.clone(), folder: at("killed") };
+            let sent = job.harassed(took.mul_f64(0.5), &mut rng);
+            println!("{}: {sent:?}", args[..5].join(" "));
+            sent.into_iter().for_each(|signal| *signals.entry(signal).or_default() += 1);
+            let killed = results(&job.folder);
+            assert_eq!(killed.keys().collect::<Vec<_>>(), whole.keys().collect::<Vec<_>>(), "{args:?}");
+            for (file, bytes) in whole {
+                assert!(&killed[file] == bytes, "{args:?}: {} differs", file.display());
+            }
+            fs::remove_dir_all(&job.folder).expect("a writable folder");
+        }
+        rounds += 1;
+    }
+    println!(
+        "{rounds} rounds of {} commands, killed by {signals:?}: the same weights and tables each time",
+        jobs.len()
+    );
+}
