@@ -9,23 +9,44 @@
 //! ```
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::error::{Error, Result};
 
 /// Writes a file atomically, and creates its folder if necessary. The bytes go to a temporary file in the same folder, which
-/// is then renamed, so that a crash, a full disk or Ctrl-C leaves either the old file or the new one.
+/// is then renamed, so that a crash, a full disk or Ctrl-C leaves either the old file or the new one. A symbolic link stays: what
+/// it points at is written.
 ///
 /// # Errors
 /// If the folder cannot be created, or the file cannot be written.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let path = &target(path)?;
+    // A pipe or a device cannot be replaced by a file.
+    if path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        return std::fs::write(path, bytes).map_err(Error::io("write", path));
+    }
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let mut file = temporary().tempfile_in(folder).map_err(Error::io("write in", folder))?;
     file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(Error::io("write", path))?;
     file.persist(path).map_err(|failed| Error::io("write", path)(failed.error))?;
     Ok(())
+}
+
+/// What a path points at, through symbolic links.
+///
+/// # Errors
+/// If there are so many of them that they must form a loop.
+fn target(path: &Path) -> Result<PathBuf> {
+    let mut target = path.to_path_buf();
+    for _ in 0..40 {
+        match std::fs::read_link(&target) {
+            Ok(link) => target = target.parent().unwrap_or(Path::new("")).join(link),
+            Err(_) => return Ok(target),
+        }
+    }
+    Err(Error::io("write", path)(std::io::Error::other("its symbolic links form a loop")))
 }
 
 /// Removes the temporary files that killed processes have left in a folder, if they are older than `age`: younger ones may be
@@ -59,6 +80,29 @@ fn temporary() -> tempfile::Builder<'static, 'static> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn links_and_devices_stay_what_they_are() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().expect("a folder");
+        let here = folder.path();
+        let read = |name: &str| std::fs::read(here.join(name)).expect(name);
+        std::fs::create_dir(here.join("elsewhere")).expect("a writable folder");
+        // Relative to the folder of the link; what it points at need not be there yet.
+        symlink("elsewhere/table.csv", here.join("table.csv")).expect("a link");
+        symlink(here.join("table.csv"), here.join("link to link")).expect("a link");
+        for text in ["one", "two"] {
+            write(&here.join("link to link"), text.as_bytes()).expect("a writable folder");
+            assert_eq!(read("elsewhere/table.csv"), text.as_bytes());
+            assert!(here.join("table.csv").is_symlink() && here.join("link to link").is_symlink());
+        }
+        symlink("loop", here.join("loop")).expect("a link");
+        let problem = write(&here.join("loop"), b"nowhere").expect_err("a loop").to_string();
+        assert!(problem.contains("loop") && problem.contains("symbolic links"), "{problem}");
+        write(Path::new("/dev/null"), b"nothing").expect("a device");
+        assert!(!Path::new("/dev/null").is_file());
+    }
 
     #[test]
     fn what_a_kill_left_behind_is_swept() {

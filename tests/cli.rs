@@ -39,6 +39,8 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--methods", "random,petz"], &["unknown method `petz`"]);
     refused(here, &["study", "--tasks", "pendulum,pendulum"], &["the task `pendulum` is named twice"]);
     refused(here, &["study", "--methods", "random,debug,debug"], &["the method `debug` is named twice"]);
+    refused(here, &["study", "--seeds", "1000000"], &["6000000 runs", "at most 100000", "fewer seeds"]);
+    refused(here, &["study", "--seeds", "0..1000000000"], &["`seed` is 999999999", "it must lie in 0..1048576"]);
     refused(here, &["study", "--seeds", "3..3"], &["no seeds", "3..3"]);
     refused(here, &["study", "--seeds", "0"], &["no seeds"]);
     refused(here, &["study", "--seeds", "few"], &["'few'", "--seeds", "a number of seeds"]);
@@ -179,6 +181,52 @@ fn train_evaluate_and_watch() {
 }
 
 #[cfg(unix)]
+/// The program ends as if all had been read, or says in one line what could not be written.
+#[cfg(unix)]
+#[test]
+fn nobody_has_to_listen() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let shell = |command: &str| {
+        let command = command.replace("handful", env!("CARGO_BIN_EXE_handful"));
+        Command::new("sh").current_dir(here).args(["-c", &command]).output().expect("a shell")
+    };
+    let train = "handful train --task pendulum --method debug --out";
+    for (run, rest) in [("pipe", "2>&1 | true"), ("closed", ">&- 2>&-"), ("full", "2>/dev/full")] {
+        let output = shell(&format!("{train} {run} {rest}"));
+        let said = text(&output.stderr);
+        assert!(output.status.success() && said.is_empty(), "{rest}: {said}");
+        assert!(here.join(run).join("summary.toml").exists(), "{rest}: the run is complete");
+    }
+    let output = shell("handful evaluate --run pipe --episodes 1 >/dev/full");
+    let said = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("cannot write to standard output") && said.lines().count() == 1, "{said}");
+}
+
+/// There is nothing to save.
+#[cfg(unix)]
+#[test]
+fn signals_end_an_evaluation() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let output = handful(here, &["train", "--task", "pendulum", "--method", "debug", "--out", "run"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    for signal in ["-INT", "-TERM", "-HUP"] {
+        let child = Command::new(env!("CARGO_BIN_EXE_handful"))
+            .current_dir(here)
+            .args(["evaluate", "--run", "run", "--episodes", "1000000"])
+            .spawn()
+            .expect("the program starts");
+        std::thread::sleep(Duration::from_millis(300));
+        let sent = Instant::now();
+        let kill = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
+        assert!(kill.success());
+        let output = child.wait_with_output().expect("the program ends");
+        assert!(!output.status.success() && sent.elapsed() < Duration::from_secs(10), "{signal}");
+    }
+}
+
 #[test]
 fn signals_leave_a_run_that_resumes() {
     let folder = tempfile::tempdir().expect("a folder");

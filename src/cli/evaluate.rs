@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::output::answer;
 use crate::error::Result;
 use crate::study::evaluate::{EvalSeeds, Evaluator};
 use crate::study::registry::Registry;
@@ -31,10 +32,9 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let seeds = args.seed.map_or(args.starts.unwrap_or(config.starts).test(), EvalSeeds::Seed);
     let mut evaluator = Evaluator::new(|| registry.make_env(&config))?;
     let summary = evaluator.evaluate(&mut method, args.episodes, seeds)?.summary();
-    if args.json {
-        println!("{}", serde_json::to_string_pretty(&summary).expect("a summary is JSON"));
+    answer(if args.json {
+        serde_json::to_string_pretty(&summary).expect("a summary is JSON")
     } else {
-        print!("{}", toml::to_string(&summary).expect("a summary is TOML"));
-    }
-    Ok(())
+        toml::to_string(&summary).expect("a summary is TOML").trim_end().into()
+    })
 }

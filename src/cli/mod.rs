@@ -3,6 +3,7 @@
 //! The program `handful` is this with [`Registry::standard`]; a program of one's own registers more and calls [`main`].
 
 mod evaluate;
+mod output;
 mod progress;
 mod report;
 mod study;
@@ -16,6 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::{Parser, Subcommand};
 use console::style;
 
+use self::output::note;
 use crate::error::{Error, Result};
 use crate::study::registry::Registry;
 
@@ -48,42 +50,44 @@ pub fn main(registry: &Registry) -> ExitCode {
         Ok(cli) => cli,
         // One line, as for all other values that cannot be used.
         Err(problem) if problem.kind() == clap::error::ErrorKind::ValueValidation => {
-            eprintln!("{}", problem.render().to_string().lines().next().unwrap_or_default());
+            note(problem.render().to_string().lines().next().unwrap_or_default());
             return ExitCode::from(2);
         }
         Err(problem) => problem.exit(),
     };
-    let stop = Arc::new(AtomicBool::new(false));
-    let outcome = stop_on_ctrl_c(&stop).and_then(|()| match cli.command {
-        None => study::run(registry, study::Args::default(), &stop),
-        Some(Command::Study(args)) => study::run(registry, args, &stop),
-        Some(Command::Train(args)) => train::run(registry, args, &stop),
+    let outcome = match cli.command {
+        None => study::run(registry, study::Args::default()),
+        Some(Command::Study(args)) => study::run(registry, args),
+        Some(Command::Train(args)) => train::run(registry, args),
         Some(Command::Evaluate(args)) => evaluate::run(registry, &args),
         Some(Command::Report(args)) => report::run(&args),
         Some(Command::Watch(args)) => watch::run(registry, &args),
-    });
+    };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(Error::Interrupted) => {
-            eprintln!("{}", Error::Interrupted);
+            note(Error::Interrupted);
             ExitCode::from(130)
         }
         Err(error) => {
-            eprintln!("{} {error}", style("error:").red().bold().for_stderr());
+            note(format_args!("{} {error}", style("error:").red().bold().for_stderr()));
             ExitCode::from(2)
         }
     }
 }
 
-/// The first Ctrl-C asks runs to finish their episode (in a test, the batch of episodes that run side by side) and to
-/// save; the second ends the program.
-fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> Result<()> {
-    let stop = Arc::clone(stop);
-    ctrlc::set_handler(move || {
-        if stop.swap(true, Ordering::Relaxed) {
+/// For commands that have something to save; the others simply end. The first Ctrl-C asks runs to finish their episode (in a
+/// test, the batch of episodes that run side by side) and to save, by setting what is returned; the second ends the program.
+/// SIGTERM and SIGHUP do the same.
+fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    let set = ctrlc::set_handler(move || {
+        if asked.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
-        eprintln!("\nfinishing the episodes that have begun and saving; press Ctrl-C again to quit at once");
-    })
-    .map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))
+        note("\nfinishing the episodes that have begun and saving; press Ctrl-C again to quit at once");
+    });
+    set.map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))?;
+    Ok(stop)
 }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
 
+use super::output::note;
 use crate::study::config::RunConfig;
 use crate::study::run::Event;
 use crate::study::runner::StudyObserver;
@@ -84,7 +85,7 @@ impl StudyObserver for Progress {
         bar.enable_steady_tick(Duration::from_millis(250));
         if !self.on_terminal {
             let resumed = if done > 0 { format!(", going on after {done} steps") } else { String::new() };
-            eprintln!("{}: started{resumed}", shown.name);
+            note(format_args!("{}: started{resumed}", shown.name));
         }
         shown.bar = Some(bar);
     }
@@ -128,7 +129,7 @@ impl StudyObserver for Progress {
             }
         }
         if let (false, Some(line)) = (self.on_terminal, line) {
-            eprintln!("{line}");
+            note(line);
         }
     }
 }

@@ -20,9 +20,8 @@ pub(super) fn run(args: &Args) -> Result<()> {
 
 #[cfg(feature = "study")]
 pub(super) fn write(from: &Path, to: &Path) -> Result<()> {
-    println!("{}", crate::study::report::write(from, to)?);
-    println!("report: {}", to.join("report.md").display());
-    Ok(())
+    let table = crate::study::report::write(from, to)?;
+    super::output::answer(format_args!("{table}\nreport: {}", to.join("report.md").display()))
 }
 
 #[cfg(not(feature = "study"))]

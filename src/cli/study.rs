@@ -3,9 +3,9 @@
 use std::num::NonZeroUsize;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
 use super::progress::Progress;
+use super::stop_on_ctrl_c;
 use crate::error::Result;
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
@@ -59,7 +59,7 @@ enum ProfileArg {
     Full,
 }
 
-pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<()> {
+pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     let (profile, name) = match args.profile {
         ProfileArg::Quick => (Profile::Quick, "quick"),
         ProfileArg::Full => (Profile::Full, "full"),
@@ -72,8 +72,9 @@ pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
     let mut runs = plan.runs(registry)?;
     runs.iter_mut().for_each(|(config, _)| config.starts = args.starts.unwrap_or(config.starts));
+    let stop = stop_on_ctrl_c()?;
     let progress = Progress::new(&runs);
-    runner::carry_out_all(registry, &runs, jobs, &progress, stop)?;
+    runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
     progress.finish();
     conclude(&runs, &plan.folder)
 }
@@ -95,6 +96,6 @@ fn conclude(runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
 
 #[cfg(not(feature = "study"))]
 fn conclude(_runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
-    println!("the runs are in {}; build with the feature `study` for tables and figures", folder.display());
-    Ok(())
+    let advice = "build with the feature `study` for tables and figures";
+    super::output::answer(format_args!("the runs are in {}; {advice}", folder.display()))
 }

@@ -1,9 +1,10 @@
 //! `train`: one run.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
+use super::output::answer;
 use super::progress::Progress;
+use super::stop_on_ctrl_c;
 use crate::error::{Error, Result};
 use crate::study::registry::Registry;
 use crate::study::run::is_complete;
@@ -35,20 +36,21 @@ pub(super) struct Args {
     out: Option<PathBuf>,
 }
 
-pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<()> {
+pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     let Args { task, method, steps, seed, starts, config, out } = args;
     let mut config = registry.config(&task, &method, seed, steps, config.as_deref())?;
     config.starts = starts.unwrap_or(config.starts);
     let folder = out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{method}-seed{seed}")));
     if is_complete(&folder, &config) {
-        println!("this run is complete: {}", folder.display());
+        answer(format_args!("this run is complete: {}", folder.display()))?;
         return print_test(&folder);
     }
+    let stop = stop_on_ctrl_c()?;
     let runs = vec![(config, folder)];
     let progress = Progress::new(&runs);
     let (config, folder) = &runs[0];
     // Inside the thread pool, so that parallel pieces of an update need no hand-over.
-    rayon::scope(|_| runner::carry_out(registry, 0, config, folder, &progress, stop))?;
+    rayon::scope(|_| runner::carry_out(registry, 0, config, folder, &progress, &stop))?;
     progress.finish();
     print_test(folder)
 }
@@ -56,7 +58,5 @@ pub(super) fn run(registry: &Registry, args: Args, stop: &AtomicBool) -> Result<
 fn print_test(folder: &Path) -> Result<()> {
     let path = folder.join("summary.toml");
     let text = std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
-    print!("{text}");
-    println!("run: {}", folder.display());
-    Ok(())
+    answer(format_args!("{text}run: {}", folder.display()))
 }

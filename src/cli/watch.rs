@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::output::answer;
 use crate::error::{Error, Result};
 use crate::study::registry::Registry;
 use crate::study::starts::EvalSeeds;
@@ -49,6 +50,5 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let path = args.out.clone().unwrap_or(default);
     recording.write(&path)?;
     let outcome = if recording.success() { "success" } else { "no success" };
-    println!("{} steps, {outcome}; open {} in a browser", recording.steps(), path.display());
-    Ok(())
+    answer(format_args!("{} steps, {outcome}; open {} in a browser", recording.steps(), path.display()))
 }

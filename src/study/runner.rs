@@ -10,6 +10,9 @@ use super::run::{Event, is_complete};
 use super::starts::{LIMIT, check_below};
 use crate::error::{Error, Result};
 
+/// More runs than anybody waits for.
+pub const MOST_RUNS: u64 = 100_000;
+
 /// How much a study takes on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Profile {
@@ -53,7 +56,8 @@ impl StudyPlan {
     /// The runs, each with its folder. A method that does not learn runs once.
     ///
     /// # Errors
-    /// If there is nothing to run, something is to be run twice, a seed is not below [`LIMIT`], or a method or task is unknown.
+    /// If there is nothing to run, something is to be run twice, there are more than [`MOST_RUNS`], a seed is not below [`LIMIT`],
+    /// or a method or task is unknown.
     pub fn runs(&self, registry: &Registry) -> Result<Vec<(RunConfig, PathBuf)>> {
         if self.seeds.is_empty() {
             return Err(Error::Config(format!(
@@ -72,21 +76,26 @@ impl StudyPlan {
                 return Err(Error::Config(format!("the {what} `{twice}` is named twice; name it once")));
             }
         }
+        let pairs = self.tasks.len() * self.methods.len();
+        let most = pairs as u64 * (self.seeds.end - self.seeds.start);
+        if most > MOST_RUNS {
+            return Err(Error::Config(format!(
+                "{} tasks, {} methods and {} seeds are {most} runs; a study has at most {MOST_RUNS}: take fewer seeds",
+                self.tasks.len(),
+                self.methods.len(),
+                self.seeds.end - self.seeds.start
+            )));
+        }
         let mut runs = Vec::new();
-        for task in &self.tasks {
-            for method in &self.methods {
-                for seed in self.seeds.clone() {
-                    let config = registry.config(task, method, seed, None, None)?;
-                    // Finds out now, not hours later, whether the method can be used for the task.
-                    registry.method(&config)?;
-                    let folder = self.folder.join(task).join(method).join(format!("seed{seed}"));
-                    let learns = config.learns();
-                    runs.push((config, folder));
-                    if !learns {
-                        break;
-                    }
-                }
-            }
+        for (task, method) in self.tasks.iter().flat_map(|task| self.methods.iter().map(move |method| (task, method))) {
+            let config = registry.config(task, method, self.seeds.start, None, None)?;
+            // Finds out now, not hours later, whether the method can be used for the task.
+            registry.method(&config)?;
+            let seeds = if config.learns() { self.seeds.clone() } else { self.seeds.start..self.seeds.start + 1 };
+            runs.extend(seeds.map(|seed| {
+                let folder = self.folder.join(task).join(method).join(format!("seed{seed}"));
+                (RunConfig { seed, ..config.clone() }, folder)
+            }));
         }
         Ok(runs)
     }

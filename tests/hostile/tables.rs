@@ -346,6 +346,8 @@ fn a_cell_that_cannot_be_true_is_named() {
         ("evaluations.csv", "step", "1e3", "a whole number"),
         ("evaluations.csv", "return_mean", "inf", "it must be finite"),
         ("models.csv", "rmse", "small", "it must be a number"),
+        ("models.csv", "coverage90", "1.5", "it must lie in [0, 1]"),
+        ("values.csv", "correlation", "inf", "it must lie in [-1, 1]"),
         ("tests.csv", "success", "1", "`true` or `false`"),
         ("tests.csv", "starts", "elsewhere", "`test` or `development`"),
     ] {
@@ -363,7 +365,7 @@ fn a_model_that_diverged_is_reported() {
     for number in ["inf", "NaN", "1e308", ""] {
         let mut study = Study::committed("quick");
         for (table, column) in
-            [("models.csv", "rmse"), ("values.csv", "expected"), ("values.csv", "correlation"), ("tests.csv", "sparc")]
+            [("models.csv", "rmse"), ("values.csv", "expected"), ("values.csv", "realised"), ("tests.csv", "sparc")]
         {
             set_cell(&mut study, table, 2, column, number);
         }

@@ -28,6 +28,8 @@ enum Cell {
     /// What is not always there: nothing, or any number. A movement that never began has no smoothness, the error of a model
     /// that diverged is infinite.
     Measure,
+    /// The same, but a number lies between these two.
+    Within(f64, f64),
 }
 
 /// The columns of a table.
@@ -75,7 +77,7 @@ pub(super) const MODELS: Layout = Layout {
         ("horizon", MANY, Always),
         ("rmse", Cell::Measure, Always),
         ("nll", Cell::Measure, Optional),
-        ("coverage90", Cell::Measure, Always),
+        ("coverage90", Cell::Within(0.0, 1.0), Always),
         ("rmse_p90", Cell::Measure, Optional),
     ],
     order: &["step", "horizon"],
@@ -88,7 +90,7 @@ pub(super) const VALUES: Layout = Layout {
         ("expected", Cell::Measure, Always),
         ("realised", Cell::Measure, Always),
         ("rmse", Cell::Measure, Optional),
-        ("correlation", Cell::Measure, Always),
+        ("correlation", Cell::Within(-1.0, 1.0), Always),
     ],
     order: &["step"],
     counts: false,
@@ -204,7 +206,7 @@ impl Cells {
             Cell::Name | Cell::Starts => Self::Text(cell, Vec::new()),
             Cell::Count(limit) => Self::Whole(limit, Vec::new()),
             Cell::Flag => Self::Flags(Vec::new()),
-            Cell::Share | Cell::Number | Cell::Measure => Self::Numbers(cell, Vec::new()),
+            Cell::Share | Cell::Number | Cell::Measure | Cell::Within(..) => Self::Numbers(cell, Vec::new()),
         }
     }
 
@@ -229,11 +231,14 @@ impl Cells {
                 "false" => false,
                 _ => return Err("it must be `true` or `false`".into()),
             }),
-            Self::Numbers(Cell::Measure, numbers) if text.is_empty() => numbers.push(None),
+            Self::Numbers(Cell::Measure | Cell::Within(..), numbers) if text.is_empty() => numbers.push(None),
             Self::Numbers(cell, numbers) => {
                 let number: f64 = text.parse().map_err(|_| "it must be a number")?;
                 match cell {
                     Cell::Share if !(0.0..=1.0).contains(&number) => return Err("it must lie in [0, 1]".into()),
+                    Cell::Within(low, high) if !(number.is_nan() || (*low..=*high).contains(&number)) => {
+                        return Err(format!("it must lie in [{low}, {high}]"));
+                    }
                     Cell::Number if !number.is_finite() => return Err("it must be finite".into()),
                     _ => numbers.push(Some(number)),
                 }
