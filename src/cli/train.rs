@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use super::output::answer;
 use super::progress::Progress;
 use super::stop_on_ctrl_c;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::study::registry::Registry;
-use crate::study::run::is_complete;
+use crate::study::run::{is_complete, read_summary};
 use crate::study::runner;
 use crate::study::starts::Starts;
 
@@ -56,7 +56,6 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
 }
 
 fn print_test(folder: &Path) -> Result<()> {
-    let path = folder.join("summary.toml");
-    let text = std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
+    let text = toml::to_string(&read_summary(folder)?).expect("a summary is TOML");
     answer(format_args!("{text}run: {}", folder.display()))
 }

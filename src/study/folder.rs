@@ -1,8 +1,11 @@
 //! A run's folder: who may write in it, whose run it holds, and what a resumed run starts from.
 
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
 
 use super::config::{RunConfig, bad_config};
 use super::evaluate::{Evaluation, Summary};
@@ -102,22 +105,71 @@ impl RunFolder {
     ///
     /// # Errors
     /// If a file cannot be written.
-    pub fn complete(&self, test: &Evaluation) -> Result<()> {
+    pub fn complete(&self, config: &RunConfig, test: &Evaluation) -> Result<()> {
         write_test(&self.path, test)?;
-        let summary = toml::to_string(&test.summary()).expect("a summary is TOML");
-        files::write(&self.path.join(SUMMARY), summary.as_bytes())
+        let files = TABLES.into_iter().chain(config.learns().then_some(WEIGHTS));
+        let checksums = files.map(|file| Ok((file.into(), checksum(&self.path.join(file))?)));
+        let completed = Completed { summary: test.summary(), checksums: checksums.collect::<Result<_>>()? };
+        let completed = toml::to_string(&completed).expect("a summary is TOML");
+        files::write(&self.path.join(SUMMARY), completed.as_bytes())
     }
 }
 
-/// Whether a folder holds this run, complete with its tables and weights. What is lost can be written anew from the
+/// What a run's `summary.toml` holds.
+#[derive(Serialize, Deserialize)]
+struct Completed {
+    #[serde(flatten)]
+    summary: Summary,
+    /// CRC-32 of each other file that it ended with; the first edition wrote none.
+    #[serde(default)]
+    checksums: BTreeMap<String, u32>,
+}
+
+impl Completed {
+    fn read(folder: &Path) -> Result<Self> {
+        let path = folder.join(SUMMARY);
+        let text = std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
+        toml::from_str(&text).map_err(|problem: toml::de::Error| Error::data(&path)(problem.message().to_string()))
+    }
+
+    /// The first file, of those with this ending, that is not what it was when the run ended.
+    fn changed(&self, folder: &Path, ending: &str) -> Option<PathBuf> {
+        let files = self.checksums.iter().filter(|(file, _)| file.ends_with(ending));
+        let mut files = files.map(|(file, checksum)| (folder.join(file), checksum));
+        files.find_map(|(path, expected)| (checksum(&path).ok() != Some(*expected)).then_some(path))
+    }
+}
+
+fn checksum(path: &Path) -> Result<u32> {
+    Ok(crc32fast::hash(&std::fs::read(path).map_err(Error::io("read", path))?))
+}
+
+/// Whether a folder holds this run, complete with its tables and weights. What is lost or damaged can be written anew from the
 /// checkpoint, by opening the run; without a checkpoint the run has ended as it is.
 pub fn is_complete(folder: &Path, config: &RunConfig) -> bool {
     let this_run = RunConfig::read(&folder.join(CONFIG)).is_ok_and(|there| there == *config);
-    let summary = std::fs::read_to_string(folder.join(SUMMARY)).unwrap_or_default();
-    let has = |file: &str| folder.join(file).exists();
-    this_run
-        && toml::from_str::<Summary>(&summary).is_ok()
-        && (!has(CHECKPOINT) || (TABLES.into_iter().all(has) && (has(WEIGHTS) || !config.learns())))
+    let intact = |run: Completed| !folder.join(CHECKPOINT).is_file() || run.changed(folder, "").is_none();
+    this_run && Completed::read(folder).is_ok_and(intact)
+}
+
+/// The results of a complete run's test.
+///
+/// # Errors
+/// If there are none, or they are damaged.
+pub fn read_summary(folder: &Path) -> Result<Summary> {
+    Ok(Completed::read(folder)?.summary)
+}
+
+/// # Errors
+/// If the tables of a complete run are not those that it ended with.
+pub(super) fn check_tables(folder: &Path) -> Result<()> {
+    match Completed::read(folder).ok().and_then(|run| run.changed(folder, ".csv")) {
+        None => Ok(()),
+        Some(path) => {
+            let advice = "it was lost or changed after the run had ended; the command that made the run writes it anew";
+            Err(Error::data(&path)(advice))
+        }
+    }
 }
 
 /// The configuration of the run in a folder.

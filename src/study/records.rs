@@ -22,7 +22,7 @@ const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90"
 const VALUE_COLUMNS: [&str; 5] = ["step", "expected", "realised", "rmse", "correlation"];
 const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
 
-/// The files that a complete run has.
+/// The tables that a complete run has.
 pub(super) const TABLES: [&str; 6] =
     ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"];
 

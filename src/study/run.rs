@@ -27,7 +27,7 @@ use std::time::{Duration, Instant};
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Evaluator};
 use super::folder::RunFolder;
-pub use super::folder::is_complete;
+pub use super::folder::{is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
 use crate::agent::{Method, Mode};
@@ -228,7 +228,7 @@ impl<E: Env> Run<E> {
         if !complete {
             return Ok(Event::Testing(test.results.len()));
         }
-        self.folder.complete(test)?;
+        self.folder.complete(&self.config, test)?;
         Ok(Event::Tested(test.clone()))
     }
 

@@ -10,6 +10,7 @@ use handful::prelude::*;
 use handful::study::config::RunConfig;
 use handful::study::run::{Event, Run, is_complete};
 use handful::study::runner::{StudyObserver, carry_out_all};
+use handful::study::tables::Tables;
 use proptest::prelude::*;
 use proptest::sample::Index;
 use safetensors::{Dtype, SafeTensors};
@@ -109,12 +110,18 @@ fn what_a_finished_run_lost_comes_back() {
     let mut files = vec!["config.toml", "summary.toml", WEIGHTS];
     files.extend(["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"]);
     for file in &files[1..] {
-        for damaged in [None, Some("")] {
-            let whole = fs::read(here.join(file)).expect(file);
+        let whole = fs::read(here.join(file)).expect(file);
+        let flipped = whole.iter().enumerate().map(|(i, byte)| byte ^ u8::from(i == whole.len() / 2)).collect();
+        for damaged in [None, Some(Vec::new()), Some(flipped)] {
             match damaged {
                 None => fs::remove_file(here.join(file)).expect("a writable folder"),
-                Some(text) if *file == "summary.toml" => fs::write(here.join(file), text).expect("a writable folder"),
-                Some(_) => continue,
+                // Half of a number is a number.
+                Some(_) if *file == "summary.toml" && damaged != Some(Vec::new()) => continue,
+                Some(bytes) => fs::write(here.join(file), bytes).expect("a writable folder"),
+            }
+            if file.ends_with("csv") {
+                let said = problem(Tables::gather([here]));
+                assert!(said.contains(file) && said.contains("lost or changed after the run had ended"), "{said}");
             }
             // What a kill in the middle of a write leaves behind.
             fs::write(here.join("checkpoint/.handful-a1B2c3"), "half").expect("a writable folder");

@@ -72,7 +72,9 @@ impl TableTask for Touch {
     }
 
     fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {
-        Some(action_towards(self.way(obs), 0.0))
+        let way = self.way(obs);
+        // From above: a finger that comes from the side tips the cube over.
+        Some(action_towards(way + Vector3::z() * way.xy().norm(), 0.0))
     }
 
     fn drawn(&self, _setup: &Setup) -> Vec<Body> {

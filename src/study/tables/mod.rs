@@ -10,6 +10,7 @@ use polars::prelude::*;
 mod read;
 
 use super::config::RunConfig;
+use super::folder::check_tables;
 use super::starts::Starts;
 use super::summary::summarise;
 use crate::chart::LARGEST;
@@ -60,6 +61,7 @@ impl Tables {
                     format!("`{}` on `{}` with seed {} is there twice", config.method, config.task, config.seed);
                 return Err(Error::data(folder)(problem));
             }
+            check_tables(folder)?;
             let labelled = |file: &str, layout: &Layout| -> Result<LazyFrame> {
                 let frame = read::of_run(&folder.join(file), layout)?.lazy();
                 Ok(frame.select([
