@@ -85,8 +85,8 @@ pub(super) fn minimise<const P: usize>(
             if improved < 1e-12 * here.square() {
                 break;
             }
-        } else if step.amax() < 1e-8 {
-            // What is left is rounding.
+        } else if damping < 1.0 && step.amax() < 1e-8 {
+            // Hardly damped, and yet this short: what is left is rounding.
             break;
         } else {
             damping *= 5.0;

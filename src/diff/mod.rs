@@ -75,6 +75,9 @@ pub use swing::{CartPoleSwing, PendulumSwing};
 /// ```
 #[doc(alias = "differentiable simulator")]
 pub trait System<const N: usize, const M: usize>: Sync {
+    /// How many numbers of the state, the first ones, a step depends on. The others only follow from them, for costs to read.
+    const READS: usize = N;
+
     /// The state after a control step.
     fn step<S: RealField + Copy>(&self, state: &SVector<S, N>, action: &SVector<S, M>) -> SVector<S, N>;
 
