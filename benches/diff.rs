@@ -1,13 +1,18 @@
 //! The time of a gradient next to that of its roll-out: forward mode, reverse mode (adjoint method) and central differences, on
 //! the planar pusher, as the horizon grows. Two numbers in an action.
+//!
+//! The time of the Jacobians of a control step next to that of the step, on the arm: columns one at a time, as `linearise` has them,
+//! and all at once, in numbers that carry 17 derivatives.
 
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_forward};
+use handful::diff::derivatives::{gradient, gradient_by_differences, gradient_forward, linearise};
 use handful::diff::pusher::STATE;
-use handful::diff::{Pusher, PusherTask, roll_out};
-use nalgebra::SVector;
+use handful::diff::{FreeArm, Pusher, PusherTask, ReachTask, System, roll_out};
+use handful::env::arm::ArmDescription;
+use nalgebra::{SVector, Vector3};
+use num_dual::DualSVec64;
 
 /// As in the program itself.
 #[global_allocator]
@@ -37,5 +42,24 @@ fn gradients(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, gradients);
+fn jacobians(c: &mut Criterion) {
+    let mut group = c.benchmark_group("arm");
+    group.sample_size(10);
+    let panda = ArmDescription::panda();
+    let task = ReachTask { arm: FreeArm::new(&panda, &panda.home), goal: Vector3::new(0.1, 0.0, 1.0) };
+    let (state, action) = (task.arm.at_rest(&panda.home), Vector3::new(0.5, 0.2, -0.1));
+    let state = task.step(&state, &action);
+    group.bench_function("step", |b| b.iter(|| black_box(task.step(&state, &action))));
+    group.bench_function("columns", |b| b.iter(|| black_box(linearise(&task, &state, &action))));
+    group.bench_function("at once", |b| {
+        b.iter(|| {
+            let by_state = num_dual::jacobian(|state| task.step(&state, &action.map(DualSVec64::from_re)), &state);
+            let by_action = num_dual::jacobian(|action| task.step(&state.map(DualSVec64::from_re), &action), &action);
+            black_box((by_state, by_action))
+        })
+    });
+    group.finish();
+}
+
+criterion_group!(benches, gradients, jacobians);
 criterion_main!(benches);

@@ -1,8 +1,13 @@
 //! The arm in free space: the dynamics that [`crate::env::tabletop::Tabletop`] has while the hand touches nothing but what it holds.
 //!
 //! Kinematics and controller are the world's own, written once for any kind of number. The integrator is written again here,
-//! because rapier's knows f32 only: semi-implicit Euler on M(q) q'' = tau - c(q, q') - D q' - friction, with implicit damping.
-//! The limits of the joints are left out.
+//! because rapier's knows f32 only: semi-implicit Euler with implicit damping, at the world's physics steps, on
+//!
+//! M(q) q'' = tau - c(q, q') - D q' - friction - (what the motors do not carry of the weight of a load),
+//!
+//! where c follows from the recursive Newton-Euler algorithm (Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 5) and
+//! tau from operational-space control (Khatib 1987), both anew at each physics step. The limits of the joints are left out. rapier's
+//! Coriolis term is semi-implicit; while the arm gathers speed, the two differ by as much as a gram in the hand would make.
 //!
 //! ```
 //! use handful::diff::derivatives::linearise;
@@ -18,11 +23,11 @@
 //! assert!(step.next[14] > state[14] && step.by_action[(14, 0)] > 0.0);
 //! ```
 
-use nalgebra::{Matrix3, RealField, SVector, Vector3, convert};
+use nalgebra::{RealField, SVector, Vector3, convert};
 
 use super::System;
 use crate::env::arm::{ArmDescription, Inertia, JOINTS, JointVector};
-use crate::env::kinematics::{KinematicModel, Kinematics};
+use crate::env::kinematics::KinematicModel;
 use crate::env::osc::{Goal, OperationalSpaceController};
 use crate::env::physics::{STEPS_PER_CONTROL, TIMESTEP, dry_friction};
 use crate::env::tabletop::MAX_LEAD;
@@ -39,8 +44,8 @@ pub struct FreeArm<S: RealField = f64> {
     damping: SVector<S, JOINTS>,
     friction: SVector<S, JOINTS>,
     armature: SVector<S, JOINTS>,
-    /// What the hand holds, in the frame of the grip site. The controller does not know of it.
-    held: Option<Inertia<S>>,
+    /// The arm with what its hand holds, of which the controller does not know.
+    loaded: Option<KinematicModel<S>>,
 }
 
 impl FreeArm {
@@ -58,7 +63,7 @@ impl FreeArm {
             damping: of_links(|link| link.damping),
             friction: of_links(|link| link.friction),
             armature: of_links(|link| link.armature),
-            held: None,
+            loaded: None,
         }
     }
 
@@ -70,17 +75,18 @@ impl FreeArm {
             damping: self.damping.map(convert),
             friction: self.friction.map(convert),
             armature: self.armature.map(convert),
-            held: self.held.as_ref().map(Inertia::cast),
+            loaded: self.loaded.as_ref().map(KinematicModel::cast),
         }
     }
 }
 
 impl<S: RealField + Copy> FreeArm<S> {
-    /// The same arm with a cube in its hand: mass (kg) and half an edge (m).
+    /// The same arm with a body in its hand, given in the frame of the grip site.
     #[must_use]
-    pub fn holding(self, mass: S, half: S) -> Self {
-        let tensor = Matrix3::identity() * (mass * half * half * convert(2.0 / 3.0));
-        Self { held: Some(Inertia { mass, com: Vector3::zeros(), tensor }), ..self }
+    pub fn holding(self, body: &Inertia<S>) -> Self {
+        let mut model = self.model.clone();
+        model.hold(body);
+        Self { loaded: Some(model), ..self }
     }
 
     /// The state of the arm at rest at joint angles `q`.
@@ -108,30 +114,29 @@ impl<S: RealField + Copy> FreeArm<S> {
         let mut controller = self.controller.clone();
         controller.goal.position = seen.translation.vector + action * convert::<f64, S>(MAX_LEAD);
         for _ in 0..STEPS_PER_CONTROL {
-            let at = self.model.at(&q);
-            let torques = controller.torques(&at, &q, &qd);
-            qd += self.acceleration(&at, &q, &qd, &torques) * convert::<f64, S>(TIMESTEP);
+            qd += self.acceleration(&controller, &q, &qd) * convert::<f64, S>(TIMESTEP);
             q += qd * convert::<f64, S>(TIMESTEP);
         }
         self.state(&q, &qd)
     }
 
-    /// Joint accelerations, rad/s2, under motor torques, N m. The motors carry the weight of the arm, but not of what it holds.
+    /// Joint accelerations, rad/s2, under the controller's torques. The motors carry the weight of the arm, but not of what it
+    /// holds.
     fn acceleration(
         &self,
-        at: &Kinematics<S>,
+        controller: &OperationalSpaceController<S>,
         q: &SVector<S, JOINTS>,
         qd: &SVector<S, JOINTS>,
-        torques: &SVector<S, JOINTS>,
     ) -> SVector<S, JOINTS> {
+        let at = self.model.at(q);
+        let coriolis = at.coriolis(qd);
+        let torques = controller.torques_with(&at, q, qd, &coriolis);
         let mut applied = SVector::<S, JOINTS>::from_fn(|i, _| {
             torques[i] - dry_friction(self.friction[i], self.armature[i], qd[i], torques[i])
         });
-        let (mut mass, coriolis) = match &self.held {
-            None => (at.mass, at.coriolis(qd)),
-            Some(held) => {
-                let mut loaded = self.model.clone();
-                loaded.hold(held);
+        let (mut mass, coriolis) = match &self.loaded {
+            None => (at.mass, coriolis),
+            Some(loaded) => {
                 let loaded = loaded.at(q);
                 applied -= loaded.gravity - at.gravity;
                 (loaded.mass, loaded.coriolis(qd))
@@ -160,6 +165,18 @@ impl ReachTask {
         (state.fixed_rows::<3>(2 * JOINTS) - self.goal).norm()
     }
 
+    /// A first guess of `steps` actions from `start`: straight to the goal, slower from 5 cm on.
+    pub fn guess(&self, start: &SVector<f64, STATE>, steps: usize) -> Vec<Vector3<f64>> {
+        let mut state = *start;
+        let step = |_| {
+            let way = (self.goal - state.fixed_rows::<3>(2 * JOINTS)) / MAX_LEAD;
+            let action = way / way.norm().max(1.0);
+            state = self.arm.step(&state, &action);
+            action
+        };
+        (0..steps).map(step).collect()
+    }
+
     /// In square decimetres.
     fn square<S: RealField + Copy>(&self, state: &SVector<S, STATE>) -> S {
         (state.fixed_rows::<3>(2 * JOINTS) - self.goal.map(convert::<f64, S>)).norm_squared() * convert(100.0)
@@ -167,6 +184,8 @@ impl ReachTask {
 }
 
 impl System<STATE, 3> for ReachTask {
+    const READS: usize = 2 * JOINTS;
+
     fn step<S: RealField + Copy>(&self, state: &SVector<S, STATE>, action: &Vector3<S>) -> SVector<S, STATE> {
         self.arm.cast().step(state, action)
     }

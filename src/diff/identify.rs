@@ -1,17 +1,15 @@
 //! System identification: estimates a block's mass and friction from a recorded push.
 //!
 //! The push is simulated in the [`Pusher`] with the recorded motion of the hand; dual numbers give the derivative of every pose
-//! with respect to mass and friction, and Levenberg-Marquardt steps (damped Gauss-Newton) minimise the squared error of the
-//! poses. The unknowns are logarithms, since mass and friction are positive, with a Gaussian prior around the guess (maximum a
-//! posteriori): a slow push tells next to nothing about a mass.
+//! with respect to mass and friction, and least squares with a prior around the guess find both: a slow push tells next to
+//! nothing about a mass.
 
-use nalgebra::{SMatrix, SVector, Vector2};
+use nalgebra::{Const, SVector, Vector2};
 use num_dual::{Derivative, DualSVec64};
 
+use super::least_squares::{Found, Residuals, direction, minimise};
 use super::pusher::{DT, HALF, Pusher, SPEED, STATE};
 
-/// Standard deviation of the prior on the two logarithms.
-const DOUBT: f64 = 1.0;
 /// Standard deviation of the error of a pose that no simulator explains, m: the weight of the recording against the prior.
 const NOISE: f64 = 1e-3;
 
@@ -52,59 +50,17 @@ pub struct Identified {
     pub iterations: usize,
 }
 
-/// Residuals of all poses, and their gradients with respect to the two logarithms.
-struct Residuals {
-    values: Vec<f64>,
-    slopes: Vec<SVector<f64, 2>>,
-}
-
 impl RecordedPush {
     /// Estimates mass and friction near `guess`, whose other parameters are kept. The block starts at rest. The error of a whole
     /// trajectory has local minima, so the search starts nine times: from the guess, and a factor of three above and below.
     pub fn identify(&self, guess: Pusher<f64>) -> Identified {
         const FACTORS: [f64; 3] = [1.0, 1.0 / 3.0, 3.0];
         let beginnings = FACTORS.iter().flat_map(|mass| FACTORS.map(|friction| Vector2::new(mass.ln(), friction.ln())));
-        let found = beginnings.map(|off| self.descend(&guess, off));
-        let (_, found) = found.min_by(|a, b| a.0.total_cmp(&b.0)).expect("several beginnings");
-        found
-    }
-
-    /// Levenberg-Marquardt from `off`, the logarithm of the factors on the guess. Returns the minimised sum of squares, too.
-    fn descend(&self, guess: &Pusher<f64>, off: Vector2<f64>) -> (f64, Identified) {
-        const MOST: usize = 60;
-        let mut at = off;
-        let mut here = self.residuals(guess, at);
-        let mut damping = 1e-3;
-        let mut iterations = 0;
-        while iterations < MOST && damping < 1e8 {
-            iterations += 1;
-            let (curvature, slope) = here.normal();
-            let damped = curvature + SMatrix::from_diagonal(&(curvature.diagonal() * damping));
-            let Some(step) = damped.try_inverse().map(|inverse| -(inverse * slope)) else { break };
-            // No more than a factor of e at a time.
-            let step = step / step.amax().max(1.0);
-            let there = self.residuals(guess, at + step);
-            if there.square() < here.square() {
-                let improved = here.square() - there.square();
-                (at, here, damping) = (at + step, there, damping / 5.0);
-                if improved < 1e-12 * here.square() {
-                    break;
-                }
-            } else {
-                damping *= 5.0;
-            }
-        }
-        let seen = &here.values[2..];
-        let square: f64 = seen.iter().map(|value| value * value).sum();
-        let noise = (square / (seen.len() as f64 - 2.0).max(1.0)).sqrt();
-        let inverse = here.normal().0.try_inverse().expect("a guess leaves nothing undecided");
-        let identified = Identified {
-            pusher: Pusher { mass: guess.mass * at[0].exp(), friction: guess.friction * at[1].exp(), ..*guess },
-            deviations: [0, 1].map(|i| (noise * inverse[(i, i)].sqrt()).min(DOUBT)),
-            residual: (square / seen.len() as f64).sqrt(),
-            iterations,
-        };
-        (here.square(), identified)
+        let found = beginnings.map(|off| minimise(off, |off| self.residuals(&guess, off)));
+        let Found { off, deviations, residual, iterations, .. } =
+            found.min_by(|a, b| a.square.total_cmp(&b.square)).expect("several beginnings");
+        let pusher = Pusher { mass: guess.mass * off[0].exp(), friction: guess.friction * off[1].exp(), ..guess };
+        Identified { pusher, deviations, residual, iterations }
     }
 
     /// The poses that the block of `pusher` has under the recorded motion of the hand.
@@ -112,22 +68,16 @@ impl RecordedPush {
         self.poses(pusher)
     }
 
-    fn residuals(&self, guess: &Pusher<f64>, off: Vector2<f64>) -> Residuals {
-        let direction = |i: usize| SVector::<f64, 2>::from_fn(|j, _| f64::from(u8::from(i == j)));
+    fn residuals(&self, guess: &Pusher<f64>, off: &Vector2<f64>) -> Residuals<2> {
         let factor = |i: usize| nalgebra::ComplexField::exp(DualSVec64::new(off[i], Derivative::some(direction(i))));
         let pusher = guess.cast::<DualSVec64<2>>();
         let poses =
             self.poses(&Pusher { mass: pusher.mass * factor(0), friction: pusher.friction * factor(1), ..pusher });
-        // The prior is two more residuals.
-        let mut residuals = Residuals {
-            values: (off * (NOISE / DOUBT)).iter().copied().collect(),
-            slopes: [0, 1].map(|i| direction(i) * (NOISE / DOUBT)).to_vec(),
-        };
+        let mut residuals = Residuals::prior(off, NOISE);
         for (pose, seen) in poses.iter().zip(&self.block).skip(1) {
             for ((number, seen), size) in pose.iter().zip(seen).zip([1.0, 1.0, HALF]) {
-                residuals.values.push(size * (number.re - seen));
-                let slope = number.eps.unwrap_generic(nalgebra::Const::<2>, nalgebra::Const::<1>);
-                residuals.slopes.push(slope * size);
+                let slope = number.eps.unwrap_generic(Const::<2>, Const::<1>);
+                residuals.push((number.re, slope), *seen, size);
             }
         }
         residuals
@@ -146,19 +96,5 @@ impl RecordedPush {
             poses.push([state[2], state[3], state[4]]);
         }
         poses
-    }
-}
-
-impl Residuals {
-    fn square(&self) -> f64 {
-        self.values.iter().map(|value| value * value).sum()
-    }
-
-    /// Gauss-Newton's normal equations: curvature and gradient of half the sum of squares.
-    fn normal(&self) -> (SMatrix<f64, 2, 2>, SVector<f64, 2>) {
-        let pairs = self.values.iter().zip(&self.slopes);
-        pairs.fold((SMatrix::zeros(), SVector::zeros()), |(curvature, slope), (value, of)| {
-            (curvature + of * of.transpose(), slope + of * *value)
-        })
     }
 }

@@ -6,7 +6,7 @@
 //!
 //! - [`Ilqr`]: trajectory optimisation, and receding-horizon control with it ([`IlqrControl`]);
 //! - [`AnalyticPolicyGradient`]: a policy network trained by backpropagation through simulator and network;
-//! - [`RecordedPush::identify`]: system identification;
+//! - [`RecordedPush::identify`], [`RecordedLift::identify`]: system identification;
 //! - [`Simulated`]: a system as the objective of any planner in [`crate::plan`].
 //!
 //! ```
@@ -28,6 +28,8 @@ pub mod arm;
 pub mod derivatives;
 mod identify;
 mod ilqr;
+mod least_squares;
+mod lift;
 mod policy;
 pub mod pusher;
 mod simulated;
@@ -38,6 +40,7 @@ use nalgebra::{RealField, SVector};
 pub use arm::{FreeArm, ReachTask};
 pub use identify::{Identified, RecordedPush};
 pub use ilqr::{Ilqr, IlqrConfig, IlqrControl, Solution};
+pub use lift::{IdentifiedLoad, RecordedLift};
 pub use policy::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PolicyEnv};
 pub use pusher::{Pusher, PusherTask};
 pub use simulated::Simulated;
@@ -72,6 +75,9 @@ pub use swing::{CartPoleSwing, PendulumSwing};
 /// ```
 #[doc(alias = "differentiable simulator")]
 pub trait System<const N: usize, const M: usize>: Sync {
+    /// How many numbers of the state, the first ones, a step depends on. The others only follow from them, for costs to read.
+    const READS: usize = N;
+
     /// The state after a control step.
     fn step<S: RealField + Copy>(&self, state: &SVector<S, N>, action: &SVector<S, M>) -> SVector<S, N>;
 

@@ -26,6 +26,11 @@ impl Inertia {
 }
 
 impl<S: RealField + Copy> Inertia<S> {
+    /// A solid cube of that mass (kg) and half an edge (m) around `com` (m).
+    pub fn cube(mass: S, half: S, com: Vector3<S>) -> Self {
+        Self { mass, com, tensor: Matrix3::identity() * (mass * half * half * convert(2.0 / 3.0)) }
+    }
+
     /// The same body in a frame in which its own frame has pose `pose`.
     pub fn seen_at(&self, pose: &Isometry3<S>) -> Self {
         let r = pose.rotation.to_rotation_matrix();

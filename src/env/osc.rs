@@ -75,10 +75,20 @@ impl<S: RealField + Copy> OperationalSpaceController<S> {
     /// Joint torques (N m), beyond those that carry its weight, for the arm at joint angles `q` (rad), moving at `qd` (rad/s), whose
     /// kinematics are `at`. Motors saturate at their largest torque.
     pub fn torques(&self, at: &Kinematics<S>, q: &SVector<S, JOINTS>, qd: &SVector<S, JOINTS>) -> SVector<S, JOINTS> {
+        self.torques_with(at, q, qd, &at.coriolis(qd))
+    }
+
+    /// The same for Coriolis forces (N m) that are known already.
+    pub(crate) fn torques_with(
+        &self,
+        at: &Kinematics<S>,
+        q: &SVector<S, JOINTS>,
+        qd: &SVector<S, JOINTS>,
+        coriolis: &SVector<S, JOINTS>,
+    ) -> SVector<S, JOINTS> {
         let torque = self.operational_space_torque(at, q, qd);
         // A motor that already carries the arm has less to spare in that direction.
-        let motor =
-            (torque + at.coriolis(qd) + at.gravity).zip_map(&self.max_torque, |torque, max| torque.clamp(-max, max));
+        let motor = (torque + coriolis + at.gravity).zip_map(&self.max_torque, |torque, max| torque.clamp(-max, max));
         motor - at.gravity
     }
 
