@@ -59,9 +59,9 @@ pub fn main(registry: &Registry) -> ExitCode {
         None => study::run(registry, study::Args::default()),
         Some(Command::Study(args)) => study::run(registry, args),
         Some(Command::Train(args)) => train::run(registry, args),
-        Some(Command::Evaluate(args)) => evaluate::run(registry, &args),
-        Some(Command::Report(args)) => report::run(&args),
-        Some(Command::Watch(args)) => watch::run(registry, &args),
+        Some(Command::Evaluate(args)) => end_on_ctrl_c().and_then(|()| evaluate::run(registry, &args)),
+        Some(Command::Report(args)) => end_on_ctrl_c().and_then(|()| report::run(&args)),
+        Some(Command::Watch(args)) => end_on_ctrl_c().and_then(|()| watch::run(registry, &args)),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -76,18 +76,26 @@ pub fn main(registry: &Registry) -> ExitCode {
     }
 }
 
-/// For commands that have something to save; the others simply end. The first Ctrl-C asks runs to finish their episode (in a
+/// For commands that have nothing to save: Ctrl-C, SIGTERM and SIGHUP end the program.
+fn end_on_ctrl_c() -> Result<()> {
+    handle_ctrl_c(|| std::process::exit(130))
+}
+
+/// For commands that have something to save. The first Ctrl-C asks runs to finish their episode (in a
 /// test, the batch of episodes that run side by side) and to save, by setting what is returned; the second ends the program.
 /// SIGTERM and SIGHUP do the same.
 fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let asked = Arc::clone(&stop);
-    let set = ctrlc::set_handler(move || {
+    handle_ctrl_c(move || {
         if asked.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
         note("\nfinishing the episodes that have begun and saving; press Ctrl-C again to quit at once");
-    });
-    set.map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))?;
+    })?;
     Ok(stop)
+}
+
+fn handle_ctrl_c(handler: impl FnMut() + Send + 'static) -> Result<()> {
+    ctrlc::set_handler(handler).map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))
 }
