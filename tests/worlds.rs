@@ -62,6 +62,43 @@ fn scripted_stack_succeeds() {
     assert!(wins >= 85, "{wins} of 100");
 }
 
+#[test]
+fn scripted_door_opens_and_stays_open() {
+    let episodes = hundred(Task::Door, 200);
+    let opened = episodes.iter().filter(|(_, first, _)| first.is_some_and(|step| step <= 80)).count();
+    assert!(opened >= 95, "{opened} of 100 by step 80");
+    let held = episodes.iter().filter(|(success, ..)| *success).count();
+    assert!(held >= 95, "{held} of 100 held to the end");
+}
+
+/// A bolt that rubs on its frame while a finger presses on the handle has contacts whose history matters.
+#[test]
+fn a_restored_door_steps_on_bit_for_bit() {
+    let mut env = Task::Door.make();
+    let policy = Task::Door.scripted_policy(TableOptions::default()).expect("the door has one");
+    let mut obs = env.reset(0);
+    for moment in [34, 8] {
+        for _ in 0..moment {
+            obs = env.step(&policy(&obs)).expect("a valid action").observation;
+        }
+        let state = env.snapshot();
+        let run = |env: &mut World| -> Vec<Vec<u32>> {
+            let mut obs = obs.clone();
+            let mut rows = Vec::new();
+            for _ in 0..40 {
+                let step = env.step(&policy(&obs)).expect("a valid action");
+                rows.push(bits(&step));
+                obs = step.observation;
+            }
+            rows
+        };
+        let first = run(&mut env);
+        env.restore(&state);
+        assert_eq!(run(&mut env), first, "after {moment} more steps");
+        env.restore(&state);
+    }
+}
+
 fn random_action(size: usize, rng: &mut rng::Rng) -> Vec<f32> {
     (0..size).map(|_| rng::uniform(rng, -1.0, 1.0) as f32).collect()
 }
@@ -186,7 +223,7 @@ fn the_reward_is_a_function_of_observations() {
 
 #[test]
 fn the_clock_truncates_and_never_terminates() {
-    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum] {
+    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door, Task::Pendulum] {
         let mut env = task.make();
         env.reset(0);
         let (size, horizon) = (env.spec().action_size, env.spec().horizon);
@@ -228,7 +265,7 @@ fn options_change_what_they_say() {
     // robosuite's vectors: object state, then 50 numbers of the robot.
     let robosuite =
         TableOptions { observation: ObservationKind::Robosuite, action: ActionKind::Pose, ..TableOptions::default() };
-    for (task, objects) in [(Task::Lift, 10), (Task::Stack, 23)] {
+    for (task, objects) in [(Task::Lift, 10), (Task::Stack, 23), (Task::Door, 14)] {
         let mut env = task.make_with(robosuite).expect("an arm task");
         assert_eq!((env.reset(0).len(), env.spec().action_size), (objects + 50, 7));
         assert_eq!(env.spec().observation_size(), objects + 50);
@@ -254,33 +291,40 @@ fn bad_actions_are_refused_and_change_nothing() {
     }
 }
 
-/// 100,000 random actions, some of which hold a bound for a second, so that the arm is pressed into the
-/// table, stretched out and folded up. Nothing may become infinite, and nothing may gain much speed.
+/// Random actions, some of which hold a bound for a second, so that the arm is pressed into the table, stretched out and folded
+/// up: 20,000 on each task, or as many as `PROPTEST_CASES` says. Nothing may become infinite, and nothing may gain much speed.
 #[test]
-fn the_simulator_survives_a_hundred_thousand_random_actions() {
-    let options = TableOptions { action: ActionKind::Pose, horizon: Some(2_500), ..TableOptions::default() };
-    let fastest = (0..40_u64).into_par_iter().map(|seed| {
-        let mut env = [Task::Lift, Task::Stack][seed as usize % 2].make_with(options).expect("an arm task");
-        let mut rng = rng::stream(seed, "abuse");
-        env.reset(seed);
-        let mut fastest = 0.0_f32;
-        let mut action = random_action(7, &mut rng);
-        for i in 0..2_500 {
-            // A few episodes press straight down throughout.
-            if seed % 8 == 0 {
-                action = vec![0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0];
-            } else if i % 20 == 0 {
-                action = random_action(7, &mut rng).iter().map(|a| a.signum()).collect();
-            } else if (i / 20) % 2 == 0 {
-                action = random_action(7, &mut rng);
+fn the_simulator_survives_random_actions() {
+    const LENGTH: u64 = 2_500;
+    let asked = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok());
+    let episodes = asked.unwrap_or(20_000_u64).div_ceil(LENGTH);
+    let options = TableOptions { action: ActionKind::Pose, horizon: Some(LENGTH as usize), ..TableOptions::default() };
+    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door] {
+        let begin = std::time::Instant::now();
+        let fastest = (0..episodes).into_par_iter().map(|seed| {
+            let mut env = task.make_with(options).expect("an arm task");
+            let mut rng = rng::stream(seed, "abuse");
+            env.reset(seed);
+            let mut fastest = 0.0_f32;
+            let mut action = random_action(7, &mut rng);
+            for i in 0..LENGTH {
+                // A few episodes press straight down throughout.
+                if seed % 8 == 0 {
+                    action = vec![0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0];
+                } else if i % 20 == 0 {
+                    action = random_action(7, &mut rng).iter().map(|a| a.signum()).collect();
+                } else if (i / 20) % 2 == 0 {
+                    action = random_action(7, &mut rng);
+                }
+                let step = env.step(&action).expect("a valid action");
+                assert!(step.observation.iter().all(|x| x.is_finite()), "{task}, seed {seed}, step {i}");
+                let speed = step.observation[3..6].iter().map(|v| v * v).sum::<f32>().sqrt();
+                fastest = fastest.max(speed);
             }
-            let step = env.step(&action).expect("a valid action");
-            assert!(step.observation.iter().all(|x| x.is_finite()), "seed {seed}, step {i}");
-            let speed = step.observation[3..6].iter().map(|v| v * v).sum::<f32>().sqrt();
-            fastest = fastest.max(speed);
-        }
-        fastest
-    });
-    let fastest = fastest.reduce(|| 0.0, f32::max);
-    assert!(fastest < 5.0, "the hand reached {fastest} m/s");
+            fastest
+        });
+        let fastest = fastest.reduce(|| 0.0, f32::max);
+        println!("{task}: {} actions in {:.1?}, at most {fastest:.2} m/s", episodes * LENGTH, begin.elapsed());
+        assert!(fastest < 5.0, "{task}: the hand reached {fastest} m/s");
+    }
 }

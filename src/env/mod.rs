@@ -4,7 +4,7 @@
 //! [`KnownReward`] for planners that compute rewards from predicted observations, [`Snapshot`] for those that plan on the
 //! true dynamics. [`contract`] enforces the rules of [`Env`], [`vector`] steps many environments in parallel.
 //!
-//! [`World`] is any of this crate's environments, made by name ([`Task`]): four tasks for a robot arm ([`tabletop`]), the
+//! [`World`] is any of this crate's environments, made by name ([`Task`]): five tasks for a robot arm ([`tabletop`]), the
 //! [`pendulum`] and the [`cartpole`].
 //!
 //! ```

@@ -8,7 +8,7 @@ use super::arm::Pose;
 use super::cartpole::{CartPole, CartPoleState};
 use super::pendulum::{Pendulum, PendulumState};
 use super::scene::{Body, Camera};
-use super::tabletop::{Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
+use super::tabletop::{Door, Lift, Push, Reach, Stack, TableOptions, TableTask, Tabletop, TabletopState};
 use super::{Env, KnownReward, Snapshot, Spec, Step};
 use crate::error::{Error, Result};
 
@@ -25,6 +25,8 @@ pub enum Task {
     Lift,
     /// Put one cube on another: [`super::tabletop::Stack`].
     Stack,
+    /// Turn a handle and open a door: [`super::tabletop::Door`].
+    Door,
     /// Swing up a pendulum: [`super::pendulum`].
     Pendulum,
     /// Balance a pole: [`super::cartpole`].
@@ -33,7 +35,8 @@ pub enum Task {
 
 impl Task {
     /// All tasks.
-    pub const ALL: [Task; 6] = [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Pendulum, Task::Cartpole];
+    pub const ALL: [Task; 7] =
+        [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door, Task::Pendulum, Task::Cartpole];
 
     /// Its name on the command line.
     pub fn name(self) -> &'static str {
@@ -42,6 +45,7 @@ impl Task {
             Task::Push => "push",
             Task::Lift => "lift",
             Task::Stack => "stack",
+            Task::Door => "door",
             Task::Pendulum => "pendulum",
             Task::Cartpole => "cartpole",
         }
@@ -54,6 +58,7 @@ impl Task {
             Task::Push => Some(Arc::new(Push)),
             Task::Lift => Some(Arc::new(Lift)),
             Task::Stack => Some(Arc::new(Stack)),
+            Task::Door => Some(Arc::new(Door)),
             Task::Pendulum | Task::Cartpole => None,
         }
     }

@@ -97,6 +97,7 @@ impl Physics {
             hand: hand.into_iter().chain(pads.iter().copied()).collect(),
             joints: handles.try_into().expect("seven hinges and two slides"),
             table,
+            plate: [TABLE_HALF.into(), Vector3::new(0.0, 0.0, TABLE_TOP - TABLE_HALF[2])],
             arm,
         };
         physics.configure_joints();
@@ -137,7 +138,7 @@ impl Physics {
     }
 }
 
-fn link_body(inertia: &Inertia) -> RigidBodyBuilder {
+pub(super) fn link_body(inertia: &Inertia) -> RigidBodyBuilder {
     let m = inertia.tensor.map(|x| x as f32);
     let tensor = Matrix::from_cols_slice(m.as_slice());
     RigidBodyBuilder::dynamic()
@@ -162,12 +163,12 @@ fn collider(kind: PrimitiveKind) -> ColliderBuilder {
     }
 }
 
-fn placed(shape: &Primitive) -> ColliderBuilder {
+pub(super) fn placed(shape: &Primitive) -> ColliderBuilder {
     collider(shape.kind).position(to_rapier(&shape.pose))
 }
 
 /// A massless surface; its body's mass is given separately.
-fn surface(collider: ColliderBuilder, friction: f64) -> ColliderBuilder {
+pub(super) fn surface(collider: ColliderBuilder, friction: f64) -> ColliderBuilder {
     surface_with_density(collider.density(0.0), friction)
 }
 

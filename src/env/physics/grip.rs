@@ -23,13 +23,16 @@ pub(super) struct Grip {
 impl Physics {
     /// The grip of the hand, if it holds something.
     pub(super) fn grip(&self) -> Option<Grip> {
-        let PhysicsWorld { colliders, bodies, .. } = &self.world;
+        let PhysicsWorld { colliders, bodies, multibody_joints, .. } = &self.world;
         let pressed = |pad: ColliderHandle| {
             self.touched(pad).filter(|(_, pair)| pair.total_impulse_magnitude() > 0.0).map(|(other, _)| other)
         };
         let [left, right] = self.pads;
         let both = pressed(left).find(|one| pressed(right).any(|other| other == *one))?;
-        let object = colliders[both].parent().filter(|body| bodies[*body].is_dynamic())?;
+        // What hangs on a hinge turns about it, as the links do.
+        let free =
+            |body: &RigidBodyHandle| bodies[*body].is_dynamic() && multibody_joints.rigid_body_link(*body).is_none();
+        let object = colliders[both].parent().filter(free)?;
         Some(Grip {
             object,
             center: bodies[object].center_of_mass(),

@@ -20,12 +20,14 @@
 mod build;
 mod convert;
 mod grip;
+mod hinge;
 mod step;
 
 use nalgebra::Vector3;
 use rapier3d::prelude::*;
 
 use self::convert::{from_rapier, from_vector};
+pub use self::hinge::{Hinge, HingeState};
 pub(crate) use self::step::dry_friction;
 use super::arm::{ArmDescription, JOINTS, JointVector, Pose};
 use super::kinematics::{KinematicModel, Kinematics};
@@ -42,7 +44,7 @@ pub const TABLE_TOP: f64 = 0.8;
 /// Half extents of the table's plate, m.
 pub const TABLE_HALF: [f64; 3] = [0.4, 0.4, 0.025];
 
-/// An object that stands on the table.
+/// An object: a box on the table ([`Physics::add_box`]), or a part of what stands there ([`Physics::add_hinged`]).
 #[derive(Clone, Copy, Debug)]
 pub struct Object {
     body: RigidBodyHandle,
@@ -90,6 +92,8 @@ pub struct Physics {
     hand: Vec<ColliderHandle>,
     joints: [MultibodyJointHandle; JOINTS + 2],
     table: ColliderHandle,
+    /// Half extents and centre of the table's plate, m.
+    plate: [Vector3<f64>; 2],
 }
 
 impl Clone for Physics {
@@ -186,6 +190,11 @@ impl Physics {
             pair.and_then(|pair| pair.find_deepest_contact().map(|(_, contact)| contact.dist))
                 .map_or(f64::NEG_INFINITY, |distance| -f64::from(distance))
         })
+    }
+
+    /// The table's plate: half extents and centre, m.
+    pub fn table(&self) -> [Vector3<f64>; 2] {
+        self.plate
     }
 
     /// Poses of the base, the links and the fingers, in this order, for drawing.

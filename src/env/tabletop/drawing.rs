@@ -2,7 +2,6 @@
 
 use super::Tabletop;
 use crate::env::arm::{Pose, Primitive};
-use crate::env::physics::{TABLE_HALF, TABLE_TOP};
 use crate::env::scene::Body;
 
 /// The arm, its hand, the table, then what the task draws.
@@ -19,9 +18,10 @@ pub(super) fn bodies(tabletop: &Tabletop) -> Vec<Body> {
     }
     // The point that is controlled: small, but its trail shows the path.
     bodies.push(Body::solid("hand", "#f2a33a", vec![Primitive::ball(0.004, [0.0; 3])]));
+    let [half, _] = tabletop.state.physics.table();
     let legs = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)]
-        .map(|(x, y)| Primitive::cuboid([0.02, 0.02, 0.3875], [0.37 * x, 0.37 * y, -0.4125]));
-    let table = std::iter::once(Primitive::cuboid(TABLE_HALF, [0.0; 3])).chain(legs).collect();
+        .map(|(x, y)| Primitive::cuboid([0.02, 0.02, 0.3875], [(half.x - 0.03) * x, (half.y - 0.03) * y, -0.4125]));
+    let table = std::iter::once(Primitive::cuboid(half.into(), [0.0; 3])).chain(legs).collect();
     bodies.push(Body::solid("table", "#c9a97c", table));
     bodies.extend(tabletop.task.drawn(&tabletop.state.setup));
     bodies
@@ -31,7 +31,8 @@ pub(super) fn bodies(tabletop: &Tabletop) -> Vec<Body> {
 pub(super) fn poses(tabletop: &Tabletop) -> Vec<Pose> {
     let state = &tabletop.state;
     let hand = state.physics.kinematics(&state.physics.joint_state().q).grip;
-    let table = Pose::translation(0.0, 0.0, TABLE_TOP - TABLE_HALF[2]);
+    let [_, table] = state.physics.table();
+    let table = Pose::from(table);
     let objects = state.setup.objects.iter().map(|&object| state.physics.object_state(object).pose);
     let goal = state.setup.goal.map(|goal| Pose::translation(goal.x, goal.y, goal.z));
     state.physics.arm_poses().chain([hand, table]).chain(objects).chain(goal).collect()

@@ -51,6 +51,7 @@
 //! ```
 
 mod build;
+mod door;
 mod drawing;
 pub mod helpers;
 mod lift;
@@ -65,6 +66,7 @@ use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
+pub use door::Door;
 pub use lift::Lift;
 pub use options::{ActionKind, ObservationKind, RewardKind, TableOptions};
 pub use push::Push;
@@ -281,7 +283,7 @@ impl Env for Tabletop {
     }
 
     fn camera(&self) -> Camera {
-        Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] }
+        self.task.camera()
     }
 
     /// The hand, if observations are compact.

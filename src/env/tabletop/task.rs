@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 use crate::env::Feature;
 use crate::env::arm::Pose;
 use crate::env::physics::{JointState, Object, Physics};
-use crate::env::scene::Body;
+use crate::env::scene::{Body, Camera};
 use crate::rng::Rng;
 
 /// Indices of the hand's position (m) in every compact observation.
@@ -89,6 +89,11 @@ pub trait TableTask: Send + Sync {
 
     /// The bodies to draw: one for each object, in the order of [`Setup::objects`], then one for the goal if there is one.
     fn drawn(&self, setup: &Setup) -> Vec<Body>;
+
+    /// Where the 3D replay is seen from: by default from the front, with the table's middle in the middle.
+    fn camera(&self) -> Camera {
+        Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] }
+    }
 
     /// The action of a hand-written policy for a compact observation: hand motion (dx, dy, dz) and gripper, clipped to
     /// [-1, 1]. It shows that the task can be solved. None (the default) if there is no such policy.
