@@ -180,7 +180,7 @@ impl TableTask for Door {
 
     /// From the side that the door opens to.
     fn camera(&self) -> Camera {
-        Camera { eye: [0.75, 0.75, 1.5], target: [-0.2, -0.2, 1.0] }
+        Camera { eye: [0.8, 0.85, 1.6], target: [-0.25, -0.2, 1.02] }
     }
 }
 
