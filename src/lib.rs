@@ -120,16 +120,18 @@ pub use nalgebra;
 pub mod prelude {
     pub use crate::agent::{
         Agent, Checkpoint, Diagnostics, Dreamer, DreamerConfig, Losses, Method, Mode, Oracle, OracleConfig, Pets,
-        PetsConfig, Policy, Preset, Random, Sac, SacConfig, Scripted, Slot, Slots,
+        PetsConfig, Policy, Preset, Random, Sac, SacConfig, Scripted, Slot, Slots, TdMpc2, TdMpc2Config,
     };
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};
     pub use crate::error::{Error, Result};
-    pub use crate::model::{Ensemble, EnsembleConfig, Imagination, Propagation, WorldModel, WorldModelConfig};
+    pub use crate::model::{
+        Ensemble, EnsembleConfig, Imagination, ImplicitConfig, ImplicitModel, Propagation, WorldModel, WorldModelConfig,
+    };
     pub use crate::plan::{
-        ActionSequences, CemConfig, ControlConfig, IcemConfig, MppiConfig, Objective, Planner, PlannerConfig,
-        RecedingHorizon,
+        ActionSequences, CemConfig, ControlConfig, GuidedConfig, IcemConfig, MppiConfig, Objective, Planner,
+        PlannerConfig, RecedingHorizon,
     };
     pub use crate::replay::{ReplayBuffer, Transition};
     pub use crate::study::evaluate::{EvalSeeds, Evaluator};
