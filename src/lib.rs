@@ -77,8 +77,8 @@
 //! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
 //! | 2 | [`agent`] | agents: the wiring of what is below |
 //! | 2 | [`diff`] | differentiable simulators, iLQR, analytic policy gradients, system identification |
-//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradient ascent; receding-horizon control |
-//! | 1 | [`model`] | learned models: probabilistic ensembles, latent world models, imagination in both |
+//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI with and without a guide, gradient ascent; receding-horizon control |
+//! | 1 | [`model`] | learned models: probabilistic ensembles, latent world models with and without a decoder, imagination |
 //! | 1 | [`replay`] | transitions, episodes, replay buffers |
 //! | 0 | [`env`](mod@env) | environments: the arm at its table, pendulum, cart-pole |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
