@@ -276,6 +276,25 @@ fn gradients_of_regression_over_symlog_bins() {
     });
 }
 
+/// TD-MPC2's encoder learns more slowly than the rest, under the same clipped norm.
+#[test]
+fn a_part_of_a_module_learns_more_slowly() {
+    let mut module = Mlp::tdmpc(&device(), 1, 2, &[3], Some(1), &mut rng::stream(16, "slower"));
+    let before: Vec<Vec<f32>> = module.parameters().iter().map(|(_, p)| values(p).to_vec()).collect();
+    let mut gradients = dfdx::tensor::Gradients::leaky();
+    for (_, parameter) in module.parameters() {
+        gradients.get_or_alloc_mut(parameter).expect("memory").fill(3.0);
+    }
+    let config = AdamConfig { max_norm: Some(1.0), ..AdamConfig::new(0.01) };
+    Adam::new(config).with_slower("0.", 0.3).step(&mut module, &mut gradients);
+    for ((name, after), before) in module.parameters().into_iter().zip(before) {
+        let step = if name.starts_with("0.") { 0.003 } else { 0.01 };
+        for (after, before) in values(after).iter().zip(before) {
+            near(&name, before - after, step, 1e-5);
+        }
+    }
+}
+
 /// Numbers computed in float64 from the reference's formulas: three steps of LaProp after adaptive clipping.
 #[test]
 fn laprop_steps_as_the_reference() {
