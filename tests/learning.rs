@@ -311,7 +311,7 @@ fn small_tdmpc2(seed: u64) -> RunConfig {
     let mut config = Registry::standard().config("reach", "tdmpc2", seed, Some(600), None).expect("a preset");
     (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
     let mut tdmpc2: TdMpc2Config = config.settings().expect("TD-MPC2's settings");
-    (tdmpc2.batch, tdmpc2.warm_up, tdmpc2.updates_per_step) = (8, 200, 0.3);
+    (tdmpc2.batch, tdmpc2.warm_up, tdmpc2.updates_per_step, tdmpc2.action_repeat) = (8, 200, 0.3, 3);
     tdmpc2.model = ImplicitConfig { latent: 16, encoder: 16, units: 16, critics: 3, bins: 21, ..tdmpc2.model };
     tdmpc2.planner = GuidedConfig { population: 20, proposals: 5, elites: 5, iterations: 2, ..tdmpc2.planner };
     config.with_settings(&tdmpc2)

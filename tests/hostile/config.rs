@@ -234,7 +234,7 @@ fn numbers_must_fit_together() {
         ("dreamer", "dreamer.train_ratio = 1e6", "`dreamer`: `train_ratio` must not exceed"),
         ("tdmpc2", "tdmpc2.model.group = 7", "`tdmpc2.model`: `group` must divide `latent`"),
         ("tdmpc2", "tdmpc2.planner.elites = 1000", "`tdmpc2.planner`: `elites` must not exceed `population`"),
-        ("tdmpc2", "tdmpc2.replay = 3", "`tdmpc2`: `replay` must hold more time steps than `horizon`"),
+        ("tdmpc2", "tdmpc2.replay = 3", "`tdmpc2`: `replay` must hold more decisions than `horizon`"),
         ("dreamer", "dreamer.world.bins = 4", "`dreamer.world`: `bins` must be odd"),
     ] {
         let problem = config_of(method, text).expect_err(text).to_string();

@@ -2,10 +2,12 @@
 
 use rayon::prelude::*;
 
+use super::decision::in_decisions;
 use super::{Networks, Pilot, RunningScale, TdMpc2};
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
-use crate::checkpoint::Weights;
+use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
+use crate::model::Probed;
 use crate::model::open_loop::{OpenLoop, open_loop};
 use crate::replay::Episode;
 use crate::rng;
@@ -14,13 +16,15 @@ impl Diagnostics for TdMpc2 {
     /// Predictions are those of the latent dynamics, read out by the probe.
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         let Networks { model, probe, .. } = &self.networks;
-        open_loop(&(model, probe), &self.spec, episodes, &mut rng::stream(0, "open loop"))
+        let predictor = Probed { model, probe, action_repeat: self.config.action_repeat };
+        open_loop(&predictor, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 
     /// The mean of the critics at the policy's most likely action.
     fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
         let Networks { model, policy, .. } = &self.networks;
         let of_episode = |episode: &Episode| {
+            let episode = &in_decisions(episode, self.config.action_repeat);
             let z = model.encode(&episode.observations.concat());
             let q = model.values(model.critics(), &z, &policy.mode(&z));
             let steps = episode.observations.len();
@@ -72,11 +76,13 @@ impl Checkpoint for TdMpc2 {
         self.policy_optimiser.load(state, "policy", &self.networks.policy)?;
         self.probe_optimiser.load(state, "probe", &self.networks.probe)?;
         self.replay.load(state, "replay")?;
-        self.observed = state.count("counts", 0..=self.replay.most_pushes())? as usize;
+        let most = self.replay.most_pushes().saturating_mul(self.config.action_repeat as u64).min(MAX_COUNT);
+        self.observed = state.count("counts", 0..=most)? as usize;
         self.scale = RunningScale::new(scale.max(f32::MIN_POSITIVE));
         self.update_credit = update_credit;
         self.rng = own;
         self.pilot = Pilot::new(&self.config, self.spec.action_size, planner);
+        self.decision.reset();
         self.random.reset();
         Ok(())
     }

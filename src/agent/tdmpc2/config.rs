@@ -6,8 +6,8 @@ use crate::model::ImplicitConfig;
 use crate::plan::GuidedConfig;
 use crate::settings::{fits, ranges};
 
-/// Settings of [`TdMpc2`](super::TdMpc2). [`Preset`](crate::agent::Preset) has tuned ones; the defaults are sizes for two cores
-/// and the published constants.
+/// Settings of [`TdMpc2`](super::TdMpc2). [`Preset`](crate::agent::Preset) has tuned ones. The defaults are the published
+/// constants, but for a smaller batch and smaller networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TdMpc2Config {
@@ -15,6 +15,10 @@ pub struct TdMpc2Config {
     pub batch: usize,
     /// Steps that the model is rolled out for when it learns.
     pub horizon: usize,
+    /// Time steps for which each action is held: a decision. The model's steps, and those of a plan, are decisions; their rewards
+    /// are means.
+    #[doc(alias = "frame skip")]
+    pub action_repeat: usize,
     /// Updates for each time step; those of the warm-up are made up for at its end.
     #[doc(alias = "UTD")]
     pub updates_per_step: f32,
@@ -22,9 +26,9 @@ pub struct TdMpc2Config {
     pub warm_up: usize,
     /// Exponent of the spectrum of the random actions: 0 is white noise, 1 pink noise.
     pub warm_up_noise_beta: f64,
-    /// Capacity of the replay buffer, in time steps.
+    /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
-    /// Discount factor gamma, per time step. Without one it follows from the length of an episode:
+    /// Discount factor gamma, per decision. Without one it follows from the length of an episode:
     /// [`TdMpc2Config::discount_for`].
     #[doc(alias = "gamma")]
     pub discount: Option<f32>,
@@ -51,6 +55,7 @@ impl Default for TdMpc2Config {
         Self {
             batch: 128,
             horizon: 3,
+            action_repeat: 1,
             updates_per_step: 1.0,
             warm_up: 1000,
             warm_up_noise_beta: 0.0,
@@ -62,22 +67,16 @@ impl Default for TdMpc2Config {
             target_rate: 0.01,
             entropy: 1e-4,
             model: ImplicitConfig::default(),
-            planner: GuidedConfig {
-                population: 64,
-                proposals: 16,
-                elites: 12,
-                iterations: 3,
-                ..GuidedConfig::default()
-            },
+            planner: GuidedConfig::default(),
         }
     }
 }
 
 impl TdMpc2Config {
-    /// The discount for episodes of `steps` time steps: the setting, or else the published rule, (f - 1) / f for f = steps / 5,
-    /// between 0.95 and 0.995.
+    /// The discount for episodes of `steps` time steps: the setting, or else the published rule, (f - 1) / f for a fifth f of
+    /// their decisions, between 0.95 and 0.995.
     pub fn discount_for(&self, steps: usize) -> f32 {
-        let fifth = steps as f32 / 5.0;
+        let fifth = steps as f32 / self.action_repeat as f32 / 5.0;
         self.discount.unwrap_or_else(|| ((fifth - 1.0) / fifth).clamp(0.95, 0.995))
     }
 }
@@ -85,6 +84,7 @@ impl TdMpc2Config {
 ranges!(TdMpc2Config {
     batch: 1..=65_536,
     horizon: 1..=1000,
+    action_repeat: 1..=1000,
     updates_per_step: 0.0..=1000.0,
     warm_up: 0..=1_000_000_000,
     warm_up_noise_beta: 0.0..=10.0,
@@ -98,7 +98,7 @@ ranges!(TdMpc2Config {
     model: Nested,
     planner: Nested,
 }
-require *replay > *horizon => "`replay` must hold more time steps than `horizon`";
+require *replay > *horizon => "`replay` must hold more decisions than `horizon`";
 require fits(&[*batch, horizon + 1, model.critics, model.units + model.latent + model.bins]) =>
     "`batch` times `horizon` times the numbers in `model`'s layers does not fit into memory";
 require fits(&[planner.population, planner.horizon, 16]) =>

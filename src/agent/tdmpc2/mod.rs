@@ -17,6 +17,7 @@
 
 mod checkpoint;
 mod config;
+mod decision;
 mod planning;
 mod scale;
 mod update;
@@ -24,6 +25,7 @@ mod update;
 use rayon::prelude::*;
 
 pub use config::TdMpc2Config;
+use decision::Decision;
 use planning::{Imagined, Pilot};
 pub use scale::RunningScale;
 
@@ -51,7 +53,8 @@ const PROBE_RATE: f32 = 1e-3;
 ///
 /// let mut env = Task::Pendulum.make();
 /// let model = ImplicitConfig { latent: 16, encoder: 16, units: 16, ..ImplicitConfig::default() };
-/// let config = TdMpc2Config { model, batch: 8, warm_up: 30, updates_per_step: 0.1, ..TdMpc2Config::default() };
+/// let planner = GuidedConfig { population: 32, proposals: 8, elites: 8, iterations: 2, ..GuidedConfig::default() };
+/// let config = TdMpc2Config { model, planner, batch: 8, warm_up: 30, updates_per_step: 0.1, ..TdMpc2Config::default() };
 /// let mut agent = TdMpc2::new(env.spec(), config, 0)?;
 /// let mut obs = env.reset(0);
 /// agent.begin_episode();
@@ -84,6 +87,8 @@ pub struct TdMpc2 {
     /// Updates that are due.
     update_credit: f32,
     random: RandomActions,
+    /// What has happened so far of the present one.
+    decision: Decision,
     /// The weights to plan with; None after an update.
     frozen: Option<FrozenModel>,
     /// Plans in the environment that it learns from.
@@ -146,6 +151,7 @@ impl TdMpc2 {
             observed: 0,
             update_credit: 0.0,
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
+            decision: Decision::default(),
             frozen: None,
             pilot: Pilot::new(&config, spec.action_size, rng::stream(seed, "tdmpc2 planner")),
             slots: Slots::default(),
@@ -187,7 +193,8 @@ impl Agent for TdMpc2 {
 
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         if mode == Mode::Explore && self.observed < self.config.warm_up {
-            return self.random.next(&mut self.rng);
+            let Self { random, rng, pilot, config, .. } = self;
+            return pilot.held.next(config.action_repeat, || random.next(rng));
         }
         let (config, action_size) = (self.config.clone(), self.spec.action_size);
         let (world, pilot, slots) = self.imagined();
@@ -222,6 +229,10 @@ impl Agent for TdMpc2 {
             returns.splice(0..0, order.iter().map(|&i| iteration.returns[i]));
         };
         let action = pilot.act(world, slot.obs, false, &mut observer);
+        if returns.is_empty() {
+            // An action is held; nothing was planned.
+            return (action, Vec::new());
+        }
         let Networks { model, probe, .. } = &self.networks;
         let start = model.encode(&slot.obs.repeat(returns.len()));
         let futures = probe.rollout(model, &start, &sequences, config.planner.horizon);
@@ -235,7 +246,9 @@ impl Agent for TdMpc2 {
     }
 
     fn observe(&mut self, transition: &Transition) {
-        self.replay.push(transition);
+        if let Some(decision) = self.decision.join(transition, self.config.action_repeat) {
+            self.replay.push(&decision);
+        }
         self.observed += 1;
         if transition.terminated || transition.truncated {
             self.forget_episode();
@@ -256,8 +269,8 @@ impl Agent for TdMpc2 {
 
 impl TdMpc2 {
     fn forget_episode(&mut self) {
-        use crate::plan::Planner;
-        self.pilot.planner.reset();
+        self.pilot.reset();
+        self.decision.reset();
         self.random.reset();
     }
 }

@@ -1,6 +1,7 @@
 //! Planning in latent space (Hansen et al. 2024, section 3.2): what the planner maximises, and a planner for each environment.
 
 use super::TdMpc2Config;
+use super::decision::Held;
 use crate::model::implicit::{FrozenModel, ImplicitModel, normals};
 use crate::nn::values;
 use crate::plan::{ActionSequences, GuidedMppi, Objective, PlanObserver, Planner};
@@ -48,13 +49,17 @@ pub(super) struct Imagined<'a> {
 
 /// A planner with its own random numbers, for one environment.
 pub(super) struct Pilot {
-    pub planner: GuidedMppi,
+    planner: GuidedMppi,
+    /// The action that is held.
+    pub held: Held,
+    action_repeat: usize,
     pub rng: Rng,
 }
 
 impl Pilot {
     pub fn new(config: &TdMpc2Config, action_size: usize, rng: Rng) -> Self {
-        Self { planner: GuidedMppi::new(config.planner.clone(), action_size), rng }
+        let planner = GuidedMppi::new(config.planner.clone(), action_size);
+        Self { planner, held: Held::default(), action_repeat: config.action_repeat, rng }
     }
 
     /// The planner of a slot, which depends on nothing but the slot's index.
@@ -62,19 +67,37 @@ impl Pilot {
         Self::new(config, action_size, rng::stream(index as u64, "tdmpc2 seat"))
     }
 
-    /// The next action from `obs`. To `explore`, noise of the plan's own deviation is added.
-    pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
-        let Self { planner, rng } = self;
-        let Imagined { model, frozen, discount } = world;
-        let z = model.encode(obs);
-        let critics = model.config().critics;
-        let mut objective = LatentReturns { model: frozen, z: values(&z), critics, discount, rng: rng::fork(rng) };
-        let plan = planner.plan(&mut objective, observer, rng);
-        let mut noise = || if explore { rng::normal(rng) } else { 0.0 };
-        let numbers = plan.actions.iter().zip(planner.deviation());
-        let action = numbers.map(|(a, deviation)| (f64::from(*a) + deviation * noise()).clamp(-1.0, 1.0) as f32);
-        let action = action.collect();
-        planner.shift(1);
-        action
+    /// A new episode begins.
+    pub fn reset(&mut self) {
+        self.planner.reset();
+        self.held.reset();
     }
+
+    /// The next action from `obs`; plans when the last one has been held long enough. To `explore`, noise of the plan's own
+    /// deviation is added.
+    pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
+        let Self { planner, held, action_repeat, rng } = self;
+        held.next(*action_repeat, || plan(planner, rng, world, obs, explore, observer))
+    }
+}
+
+fn plan(
+    planner: &mut GuidedMppi,
+    rng: &mut Rng,
+    world: Imagined,
+    obs: &[f32],
+    explore: bool,
+    observer: &mut PlanObserver,
+) -> Vec<f32> {
+    let Imagined { model, frozen, discount } = world;
+    let z = model.encode(obs);
+    let critics = model.config().critics;
+    let mut objective = LatentReturns { model: frozen, z: values(&z), critics, discount, rng: rng::fork(rng) };
+    let plan = planner.plan(&mut objective, observer, rng);
+    let mut noise = || if explore { rng::normal(rng) } else { 0.0 };
+    let numbers = plan.actions.iter().zip(planner.deviation());
+    let action = numbers.map(|(a, deviation)| (f64::from(*a) + deviation * noise()).clamp(-1.0, 1.0) as f32);
+    let action = action.collect();
+    planner.shift(1);
+    action
 }

@@ -42,7 +42,7 @@ pub(crate) use frozen::FrozenModel;
 pub use loss::{ImplicitLoss, step_weights};
 pub use policy::PolicyPrior;
 pub(crate) use policy::normals;
-pub use probe::Probe;
+pub use probe::{Probe, Probed};
 
 use super::features::LatentFeatures;
 use crate::env::Spec;
