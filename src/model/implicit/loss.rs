@@ -24,7 +24,7 @@ pub struct ImplicitLoss {
 }
 
 impl ImplicitLoss {
-    /// The losses with their weights: what [`ops::total`] sums up.
+    /// The losses with their weights: what [`total`](crate::nn::ops::total) sums up.
     pub fn weighted(&self, config: &ImplicitConfig) -> Vec<(f32, Tensor3)> {
         let mut all = vec![
             (config.consistency, self.consistency.clone()),

@@ -41,7 +41,7 @@ impl PolicyPrior {
     }
 
     /// Actions for standard normal `noise` (`[rows, actions]`) in latent states that are data, and the entropy bonus
-    /// ([`entropy_bonus`]) of each: `[1, rows, actions]` and `[1, rows, 1]`. Differentiable in the policy's parameters.
+    /// of each (minus the log-density before the tanh): `[1, rows, actions]` and `[1, rows, 1]`. Differentiable in the policy's parameters.
     pub fn sample_on<T: Tape<f32, Cpu>>(&self, tape: &mut T, z: &Tensor3, noise: &[f32]) -> (Tensor3, Tensor3) {
         let head = self.head.on(tape, z, Grad::Params);
         (tape.record(&head, |head| squashed(head, noise)), entropy_bonus(tape, &head, noise))
