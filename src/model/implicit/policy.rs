@@ -40,8 +40,8 @@ impl PolicyPrior {
         self.sample_on(&mut NoneTape, z, &normals(z.shape().1 * self.actions, rng)).0
     }
 
-    /// Actions for standard normal `noise` (`[rows, actions]`) in latent states that are data, and the entropy bonus
-    /// of each (minus the log-density before the tanh): `[1, rows, actions]` and `[1, rows, 1]`. Differentiable in the policy's parameters.
+    /// Actions for standard normal `noise` (`[rows, actions]`) in latent states that are data, `[1, rows, actions]`, and the entropy
+    /// bonus of each (minus the log-density before the tanh), `[1, rows, 1]`. Differentiable in the policy's parameters.
     pub fn sample_on<T: Tape<f32, Cpu>>(&self, tape: &mut T, z: &Tensor3, noise: &[f32]) -> (Tensor3, Tensor3) {
         let head = self.head.on(tape, z, Grad::Params);
         (tape.record(&head, |head| squashed(head, noise)), entropy_bonus(tape, &head, noise))
