@@ -77,8 +77,8 @@
 //! | 3 | [`watch`] | an episode as a 3D replay in one HTML file |
 //! | 2 | [`agent`] | agents: the wiring of what is below |
 //! | 2 | [`diff`] | differentiable simulators, iLQR, analytic policy gradients, system identification |
-//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI, gradient ascent; receding-horizon control |
-//! | 1 | [`model`] | learned models: probabilistic ensembles, latent world models, imagination in both |
+//! | 1 | [`plan`] | random shooting, CEM, iCEM, MPPI with and without a guide, gradient ascent; receding-horizon control |
+//! | 1 | [`model`] | learned models: probabilistic ensembles, latent world models with and without a decoder, imagination |
 //! | 1 | [`replay`] | transitions, episodes, replay buffers |
 //! | 0 | [`env`](mod@env) | environments: the arm at its table, pendulum, cart-pole |
 //! | 0 | [`nn`] | networks, distributions, optimisers, on dfdx |
@@ -120,16 +120,18 @@ pub use nalgebra;
 pub mod prelude {
     pub use crate::agent::{
         Agent, Checkpoint, Diagnostics, Dreamer, DreamerConfig, Losses, Method, Mode, Oracle, OracleConfig, Pets,
-        PetsConfig, Policy, Preset, Random, Sac, SacConfig, Scripted, Slot, Slots,
+        PetsConfig, Policy, Preset, Random, Sac, SacConfig, Scripted, Slot, Slots, TdMpc2, TdMpc2Config,
     };
     pub use crate::env::tabletop::TableOptions;
     pub use crate::env::vector::VectorEnv;
     pub use crate::env::{Env, Feature, KnownReward, Snapshot, Spec, Step, Task, World};
     pub use crate::error::{Error, Result};
-    pub use crate::model::{Ensemble, EnsembleConfig, Imagination, Propagation, WorldModel, WorldModelConfig};
+    pub use crate::model::{
+        Ensemble, EnsembleConfig, Imagination, ImplicitConfig, ImplicitModel, Propagation, WorldModel, WorldModelConfig,
+    };
     pub use crate::plan::{
-        ActionSequences, CemConfig, ControlConfig, IcemConfig, MppiConfig, Objective, Planner, PlannerConfig,
-        RecedingHorizon,
+        ActionSequences, CemConfig, ControlConfig, GuidedConfig, IcemConfig, MppiConfig, Objective, Planner,
+        PlannerConfig, RecedingHorizon,
     };
     pub use crate::replay::{ReplayBuffer, Transition};
     pub use crate::study::evaluate::{EvalSeeds, Evaluator};

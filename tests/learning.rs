@@ -6,12 +6,12 @@ use std::sync::Arc;
 use handful::agent::dreamer::ActorCriticConfig;
 use handful::agent::{
     Agent, Diagnostics, Dreamer, DreamerConfig, Mode, Oracle, OracleConfig, Pets, PetsConfig, Policy, Preset, Sac,
-    SacConfig, Slot,
+    SacConfig, Slot, TdMpc2, TdMpc2Config,
 };
 use handful::env::{Env, Snapshot, Step, Task, World};
 use handful::error::{Error, Result};
-use handful::model::{EnsembleConfig, RssmConfig, WorldModelConfig};
-use handful::plan::{IcemConfig, PlannerConfig};
+use handful::model::{EnsembleConfig, ImplicitConfig, RssmConfig, WorldModelConfig};
+use handful::plan::{GuidedConfig, IcemConfig, PlannerConfig};
 use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng;
 use handful::study::config::RunConfig;
@@ -106,6 +106,25 @@ fn dreamer_swings_the_pendulum_up() {
     assert!(five_steps.rmse < 0.8, "{five_steps:?}: 1 is as good as predicting no change");
 }
 
+/// Values, a latent model and a planner together swing the pendulum up. (Random torques bring -1200.)
+#[test]
+fn tdmpc2_swings_the_pendulum_up() {
+    let mut config = TdMpc2Config::preset_for("tdmpc2", "pendulum").expect("a preset");
+    config.batch = 64;
+    config.model = ImplicitConfig { encoder: 64, units: 64, ..config.model };
+    let mut env = Task::Pendulum.make();
+    let mut agent = TdMpc2::new(env.spec(), config, 0).expect("usable settings");
+    for seed in 0..15 {
+        episode(&mut env, &mut agent, seed);
+    }
+    let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
+    let evaluation = evaluator.evaluate(&mut agent, 20, EvalSeeds::Test).expect("valid actions");
+    let mean = evaluation.summary().return_mean;
+    assert!(mean > -400.0, "mean return {mean}");
+    let five_steps = &agent.open_loop(&evaluation.episodes)[2];
+    assert!(five_steps.rmse < 0.8, "{five_steps:?}: 1 is as good as predicting no change");
+}
+
 /// The planner before any model is learned: on the true simulator it must be good.
 #[test]
 fn the_oracle_swings_the_pendulum_up() {
@@ -149,7 +168,7 @@ fn an_oracle_refuses_another_kind_of_environment() {
 #[test]
 fn acting_alone_is_acting_in_an_evaluation() {
     let registry = Registry::standard();
-    for config in [debug_run(7), small_pets(7), small_dreamer(7)] {
+    for config in [debug_run(7), small_pets(7), small_dreamer(7), small_tdmpc2(7)] {
         let mut method = registry.method(&config).expect("a method");
         let agent = method.as_learner().expect("it learns");
         let mut env = Task::Reach.make();
@@ -225,6 +244,33 @@ fn pieces_of_episodes_keep_what_belongs_together() {
     assert!(batch.last.contains(&true));
 }
 
+/// Slices within episodes, also where episodes are so short that most starts lead out of them, and of an episode that was cut
+/// short by a crash.
+#[test]
+fn slices_stay_within_their_episodes() {
+    let mut buffer = SequenceReplay::new(2, 1, 60);
+    assert!(buffer.sample_within_episodes(4, 4, &mut rng::stream(0, "slices")).is_none());
+    (0..90).for_each(|i| buffer.push(&transition(i as f32, i % 3 == 2)));
+    assert!(buffer.sample_within_episodes(4, 5, &mut rng::stream(0, "slices")).is_none(), "none is that long");
+    let mut resumed = SequenceReplay::new(2, 1, 60);
+    let mut state = handful::checkpoint::Weights::default();
+    (90..92).for_each(|i| buffer.push(&transition(i as f32, false)));
+    buffer.save(&mut state, "replay");
+    resumed.load(&state, "replay").expect("what was saved");
+    (93..100).for_each(|i| resumed.push(&transition(i as f32, i == 99)));
+    let batch = resumed.sample_within_episodes(300, 4, &mut rng::stream(0, "slices")).expect("long enough");
+    assert_eq!((batch.sequences, batch.length), (300, 4));
+    for i in 0..900 {
+        assert!(!batch.last[i] && !batch.first[i + 300], "no end within");
+        assert_eq!(batch.obs[2 * (i + 300)], batch.obs[2 * i] + 1.0, "the next moment of the same episode");
+    }
+    let starts: std::collections::BTreeSet<u32> = (0..300).map(|i| batch.obs[2 * i] as u32).collect();
+    assert!(
+        starts.contains(&93) && starts.contains(&96) && starts.iter().all(|s| *s >= 93 || s % 3 == 0),
+        "{starts:?}"
+    );
+}
+
 /// SAC shrunk to seconds.
 fn debug_run(seed: u64) -> RunConfig {
     Registry::standard().config("reach", "debug", seed, None, None).expect("a preset")
@@ -258,6 +304,17 @@ fn small_dreamer(seed: u64) -> RunConfig {
     dreamer.world.rssm = RssmConfig { deter: 16, blocks: 2, hidden: 8, stoch: 4, classes: 4, ..RssmConfig::default() };
     dreamer.behaviour = ActorCriticConfig { units: 16, layers: 1, horizon: 5, ..ActorCriticConfig::default() };
     config.with_settings(&dreamer)
+}
+
+/// TD-MPC2 shrunk to seconds.
+fn small_tdmpc2(seed: u64) -> RunConfig {
+    let mut config = Registry::standard().config("reach", "tdmpc2", seed, Some(600), None).expect("a preset");
+    (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
+    let mut tdmpc2: TdMpc2Config = config.settings().expect("TD-MPC2's settings");
+    (tdmpc2.batch, tdmpc2.warm_up, tdmpc2.updates_per_step, tdmpc2.action_repeat) = (8, 200, 0.3, 3);
+    tdmpc2.model = ImplicitConfig { latent: 16, encoder: 16, units: 16, critics: 3, bins: 21, ..tdmpc2.model };
+    tdmpc2.planner = GuidedConfig { population: 20, proposals: 5, elites: 5, iterations: 2, ..tdmpc2.planner };
+    config.with_settings(&tdmpc2)
 }
 
 fn open(config: &RunConfig, folder: &Path) -> Result<Run<Box<dyn Env>>> {
@@ -302,6 +359,12 @@ fn so_does_one_that_dreams() {
     ends_as_if_it_had_never_stopped(&planning.with_settings(&dreamer), &files);
 }
 
+#[test]
+fn so_does_one_that_plans_to_a_learned_value() {
+    let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"];
+    ends_as_if_it_had_never_stopped(&small_tdmpc2(1), &files);
+}
+
 /// With any number of threads. The digests that this test prints are also the same for the kernels with and without AVX-512,
 /// which `.ci/run` compares.
 #[test]
@@ -311,7 +374,7 @@ fn training_computes_the_same_bits_with_any_number_of_threads() {
     // Sums over the rows of a batch that are longer than those that a matrix product adds up in one go.
     (settings.batch, settings.length, settings.train_ratio) = (16, 40, 20.0);
     dreamer = dreamer.with_settings(&settings);
-    for config in [debug_run(9), small_pets(9), dreamer] {
+    for config in [debug_run(9), small_pets(9), dreamer, small_tdmpc2(9)] {
         let weights = [1, 2, 4].map(|threads| {
             let folder = tempfile::tempdir().expect("a folder");
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");

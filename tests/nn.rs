@@ -5,7 +5,8 @@ use dfdx::prelude::*;
 use handful::nn::kernels::{self, DenseShape, Matrix};
 use handful::nn::{
     Activation, Adam, AdamConfig, BlockDense, Grad, Init, Mlp, MlpConfig, Norm, Parameters, SquashedGaussian,
-    SymexpBins, Tensor3, Weights, copy_parameters, device, norm, ops, polyak, recurrent, tensor, values,
+    SymexpBins, SymlogBins, Tensor3, Weights, copy_parameters, device, norm, ops, polyak, recurrent, simnorm, tensor,
+    values,
 };
 use handful::rng::{self, Rng};
 
@@ -92,9 +93,13 @@ fn a_layer_does_not_depend_on_the_number_of_threads() {
 #[test]
 fn gradients_of_a_dense_layer() {
     let mut rng = rng::stream(1, "dense");
-    for (x_members, activation) in
-        [(1, Activation::Identity), (3, Activation::Identity), (3, Activation::Relu), (3, Activation::Silu)]
-    {
+    for (x_members, activation) in [
+        (1, Activation::Identity),
+        (3, Activation::Identity),
+        (3, Activation::Relu),
+        (3, Activation::Silu),
+        (3, Activation::Mish),
+    ] {
         let mut draw = || [(x_members, 7, 5), (3, 5, 4), (3, 1, 4)].map(|shape| random(shape, &mut rng));
         let mut inputs = draw();
         // A difference across the kink of a ReLU is no derivative, so these stay away from it.
@@ -149,7 +154,7 @@ fn gradients_of_normalisation() {
     let mut rng = rng::stream(2, "norm");
     // Nineteen features: one full vector and a rest.
     let mut draw = |rows: usize| random((2, rows, 19), &mut rng);
-    for activation in [Activation::Identity, Activation::Silu] {
+    for activation in [Activation::Identity, Activation::Silu, Activation::Mish] {
         check_operation!(vec![draw(6), draw(1), draw(1)], |x, [gain, shift]| norm::layer_norm(
             x,
             gain,
@@ -175,6 +180,25 @@ fn root_mean_square_normalisation_is_the_references() {
     }
 }
 
+/// Numbers computed in float64 from the reference's formula.
+#[test]
+fn layer_normalisation_with_mish_is_the_references() {
+    let x = tensor(&device(), vec![1.0, 2.0, -1.0, 0.5], (1, 1, 4));
+    let [gain, shift] = [1.0, 0.0].map(|number| tensor(&device(), vec![number; 4], (1, 1, 4)));
+    for (activation, expected) in [
+        (Activation::Identity, [0.346_409, 1.270_165, -1.501_104, -0.115_470]),
+        (Activation::Mish, [0.244_931, 1.153_672, -0.298_029, -0.064_999]),
+    ] {
+        let y = norm::layer_norm(x.clone(), &gain, &shift, activation, Grad::Input);
+        values(&y).iter().zip(expected).for_each(|(y, expected)| near("normalised", *y, expected, 1e-5));
+    }
+}
+
+#[test]
+fn gradients_of_simplicial_normalisation() {
+    check_operation!(vec![random((2, 3, 8), &mut rng::stream(13, "simplices"))], |x, []| simnorm::sim_norm(x, 4));
+}
+
 #[test]
 fn gradients_of_rows() {
     let mut rng = rng::stream(10, "rows");
@@ -186,6 +210,7 @@ fn gradients_of_rows() {
         slope.iter_mut().zip(x).for_each(|(slope, x)| *slope = 2.0 * factor * x);
         factor * x.iter().map(|x| x * x).sum::<f32>()
     }));
+    check_operation!(vec![random((3, 4, 2), &mut rng::stream(14, "mean"))], |x, []| ops::mean_of_members(x));
     check_operation!(vec![draw(2), draw(3)], |x, [other]| {
         let (x, tape) = x.split_tape();
         ops::stack(tape, &[x, other.clone()])
@@ -235,6 +260,39 @@ fn gradients_of_two_hot_losses() {
         let (x, mut tape) = x.split_tape();
         bins.loss(&mut tape, &x, &[&one, &other]).put_tape(tape)
     });
+}
+
+#[test]
+fn gradients_of_regression_over_symlog_bins() {
+    let bins = SymlogBins::new(15, 3.0);
+    let logits = || vec![random((2, 4, 15), &mut rng::stream(15, "symlog"))];
+    check_operation!(logits(), |x, []| {
+        let (x, mut tape) = x.split_tape();
+        bins.loss(&mut tape, &x, &[0.3, -5.0, 40.0, 0.0]).put_tape(tape)
+    });
+    check_operation!(logits(), |x, []| {
+        let (x, mut tape) = x.split_tape();
+        bins.decode_on(&mut tape, &x).put_tape(tape)
+    });
+}
+
+/// TD-MPC2's encoder learns more slowly than the rest, under the same clipped norm.
+#[test]
+fn a_part_of_a_module_learns_more_slowly() {
+    let mut module = Mlp::tdmpc(&device(), 1, 2, &[3], Some(1), &mut rng::stream(16, "slower"));
+    let before: Vec<Vec<f32>> = module.parameters().iter().map(|(_, p)| values(p).to_vec()).collect();
+    let mut gradients = dfdx::tensor::Gradients::leaky();
+    for (_, parameter) in module.parameters() {
+        gradients.get_or_alloc_mut(parameter).expect("memory").fill(3.0);
+    }
+    let config = AdamConfig { max_norm: Some(1.0), ..AdamConfig::new(0.01) };
+    Adam::new(config).with_slower("0.", 0.3).step(&mut module, &mut gradients);
+    for ((name, after), before) in module.parameters().into_iter().zip(before) {
+        let step = if name.starts_with("0.") { 0.003 } else { 0.01 };
+        for (after, before) in values(after).iter().zip(before) {
+            near(&name, before - after, step, 1e-5);
+        }
+    }
 }
 
 /// Numbers computed in float64 from the reference's formulas: three steps of LaProp after adaptive clipping.

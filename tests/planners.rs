@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use handful::model::EnsembleConfig;
 use handful::plan::{
-    ActionSequences, CemConfig, ControlConfig, GradientConfig, HybridConfig, IcemConfig, Iteration, MakePlanner,
-    MppiConfig, Objective, Plan, PlanObserver, Planner, PlannerConfig, RecedingHorizon, ShootingConfig,
+    ActionSequences, CemConfig, ControlConfig, GradientConfig, GuidedConfig, HybridConfig, IcemConfig, Iteration,
+    MakePlanner, MppiConfig, Objective, Plan, PlanObserver, Planner, PlannerConfig, RecedingHorizon, ShootingConfig,
 };
 use handful::prelude::*;
 use handful::rng::{self, Rng};
@@ -84,7 +84,7 @@ fn a_receding_horizon_plans_only_when_it_is_time() {
 
 /// The planners that search, each with the distance (largest over all numbers) within which it must come to an
 /// optimum.
-fn planners() -> [(&'static str, PlannerConfig, f32); 3] {
+fn planners() -> [(&'static str, PlannerConfig, f32); 4] {
     let cem = CemConfig { horizon: HORIZON, iterations: 10, ..CemConfig::default() };
     let icem =
         IcemConfig { horizon: HORIZON, population: 300, iterations: 8, noise_beta: 1.0, ..IcemConfig::default() };
@@ -96,10 +96,20 @@ fn planners() -> [(&'static str, PlannerConfig, f32); 3] {
         deviation: 0.3,
         ..MppiConfig::default()
     };
+    let guided = GuidedConfig {
+        horizon: HORIZON,
+        population: 1000,
+        iterations: 30,
+        temperature: 0.4,
+        min_deviation: 0.02,
+        max_deviation: 1.0,
+        ..GuidedConfig::default()
+    };
     [
         ("CEM", PlannerConfig::Cem(cem), 0.1),
         ("iCEM", PlannerConfig::Icem(icem), 0.25),
         ("MPPI", PlannerConfig::Mppi(mppi), 0.15),
+        ("guided MPPI", PlannerConfig::Guided(guided), 0.1),
     ]
 }
 
@@ -135,6 +145,37 @@ fn planners_find_the_bottom_of_a_bowl() {
         let distance = farthest(&plan, &target);
         assert!(distance < tolerance, "{name}: {distance} from the optimum");
     }
+}
+
+/// A search that is too short to find the optimum by itself finds what the objective proposes, held actions included.
+#[test]
+fn proposals_guide_a_short_search() {
+    struct Knowing(Vec<f32>);
+    impl Objective for Knowing {
+        fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
+            bowl(sequences, &self.0)
+        }
+        fn proposals(&mut self, count: usize, like: &ActionSequences) -> ActionSequences {
+            ActionSequences { values: self.0[..like.horizon * like.actions].repeat(count), ..like.clone() }
+        }
+    }
+    let config = GuidedConfig { horizon: HORIZON, population: 40, elites: 4, iterations: 1, ..GuidedConfig::default() };
+    let mut planner = PlannerConfig::Guided(GuidedConfig { proposals: 4, ..config.clone() }).build(2);
+    let plan = planner.plan(&mut Knowing(target()), &mut |_| {}, &mut rng::stream(0, "proposals"));
+    assert!(farthest(&plan, &target()) == 0.0 && plan.best_return == 0.0);
+    let alone = PlannerConfig::Guided(GuidedConfig { proposals: 0, ..config.clone() }).build(2);
+    let mut alone = RecedingHorizon::new(alone, 2, &ControlConfig::default());
+    alone.act(
+        &mut Knowing(target()),
+        &mut |i| assert!(i.returns.iter().all(|r| *r < -0.5)),
+        &mut rng::stream(0, "alone"),
+    );
+
+    let held: Vec<f32> = target().chunks(2).flat_map(|action| action.repeat(3)).collect();
+    let planner = PlannerConfig::Guided(GuidedConfig { proposals: 4, ..config }).build(2);
+    let mut control = RecedingHorizon::new(planner, 2, &ControlConfig { action_repeat: 3, replan_every: 1 });
+    let action = control.act(&mut Knowing(held), &mut |_| {}, &mut rng::stream(0, "held"));
+    assert_eq!(action, target()[..2]);
 }
 
 #[test]

@@ -14,7 +14,7 @@ use handful::rng;
 use rand::RngExt;
 
 /// A run that takes a few seconds, of each method that learns.
-const SMALL: [(&str, &str, &str); 4] = [
+const SMALL: [(&str, &str, &str); 5] = [
     ("pendulum", "sac", "steps = 4000\nsac = { hidden = [32, 32], batch = 32, warm_up = 400 }"),
     (
         "reach",
@@ -36,6 +36,17 @@ const SMALL: [(&str, &str, &str); 4] = [
          warm_up = 200
          world = { units = 16, layers = 1, rssm = { deter = 16, blocks = 2, hidden = 8, stoch = 4, classes = 4 } }
          behaviour = { units = 16, layers = 1, horizon = 5 }",
+    ),
+    (
+        "reach",
+        "tdmpc2",
+        "steps = 2000
+         [tdmpc2]
+         batch = 8
+         updates_per_step = 0.2
+         warm_up = 200
+         model = { latent = 16, encoder = 16, units = 16, bins = 21 }
+         planner = { population = 20, proposals = 5, elites = 5, iterations = 2 }",
     ),
     ("reach", "debug", "steps = 4000"),
 ];

@@ -31,6 +31,7 @@ mod pets;
 mod presets;
 mod sac;
 mod slots;
+mod tdmpc2;
 mod warm_up;
 
 pub use baselines::{Random, Scripted};
@@ -41,6 +42,7 @@ pub(crate) use presets::{PRESETS, preset_table, specialise};
 pub use presets::{Preset, method_names};
 pub use sac::{Sac, SacConfig};
 pub use slots::{Slot, Slots};
+pub use tdmpc2::{RunningScale, TdMpc2, TdMpc2Config};
 
 use std::collections::BTreeMap;
 

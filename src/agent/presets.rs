@@ -5,12 +5,12 @@
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use super::{DreamerConfig, OracleConfig, PetsConfig, SacConfig};
+use super::{DreamerConfig, OracleConfig, PetsConfig, SacConfig, TdMpc2Config};
 use crate::error::{Error, Result};
 use crate::settings::{choices, merge};
 
 /// Each preset's name and text.
-pub(crate) const PRESETS: [(&str, &str); 9] = [
+pub(crate) const PRESETS: [(&str, &str); 10] = [
     ("random", include_str!("../../data/presets/random.toml")),
     ("scripted", include_str!("../../data/presets/scripted.toml")),
     ("oracle", include_str!("../../data/presets/oracle.toml")),
@@ -18,6 +18,7 @@ pub(crate) const PRESETS: [(&str, &str); 9] = [
     ("dreamer", include_str!("../../data/presets/dreamer.toml")),
     ("planet", include_str!("../../data/presets/planet.toml")),
     ("size1m", include_str!("../../data/presets/size1m.toml")),
+    ("tdmpc2", include_str!("../../data/presets/tdmpc2.toml")),
     ("sac", include_str!("../../data/presets/sac.toml")),
     ("debug", include_str!("../../data/presets/debug.toml")),
 ];
@@ -73,6 +74,10 @@ impl Preset for PetsConfig {
 
 impl Preset for DreamerConfig {
     const TABLE: &'static str = "dreamer";
+}
+
+impl Preset for TdMpc2Config {
+    const TABLE: &'static str = "tdmpc2";
 }
 
 impl Preset for OracleConfig {

@@ -5,6 +5,7 @@
 //! | [`Ensemble`] | the next observation, as a Gaussian per member | PETS (Chua et al. 2018) |
 //! | [`Autoencoder`] | the next code of an observation, deterministically | |
 //! | [`WorldModel`] | the next latent state, from a history of observations | PlaNet, Dreamer (Hafner et al. 2019, 2023) |
+//! | [`ImplicitModel`] | the next latent state, rewards and values, but no observation | TD-MPC2 (Hansen et al. 2024) |
 //!
 //! An [`Ensemble`] is trained; its snapshot [`Dynamics`] predicts; [`Imagination`] rolls a snapshot out along many action
 //! sequences at once. [`uncertainty`] separates epistemic from aleatoric uncertainty, [`calibration`] and [`open_loop`]
@@ -47,6 +48,7 @@ mod dynamics;
 pub mod ensemble;
 pub mod features;
 pub mod imagination;
+pub mod implicit;
 pub mod open_loop;
 pub mod rssm;
 pub mod uncertainty;
@@ -58,5 +60,6 @@ pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit};
 pub use features::{Cube, FeatureMap, LatentFeatures, Normaliser};
 pub use imagination::{Imagination, ImaginedReturns, Propagation, Reward, Value};
+pub use implicit::{ImplicitConfig, ImplicitLoss, ImplicitModel, PolicyPrior, Probe, Probed};
 pub use rssm::{Latent, Rssm, RssmConfig};
 pub use world_model::{WorldModel, WorldModelConfig, WorldModelLoss};

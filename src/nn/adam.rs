@@ -92,6 +92,8 @@ impl AdamConfig {
 pub struct Adam {
     config: AdamConfig,
     steps: u32,
+    /// Parameters whose names begin so learn at this multiple of the rate.
+    slower: Option<(&'static str, f32)>,
     /// First and second moments of each parameter, by its name.
     moments: BTreeMap<String, [Vec<f32>; 2]>,
 }
@@ -99,7 +101,13 @@ pub struct Adam {
 impl Adam {
     /// A new optimiser, with moments of zero.
     pub fn new(config: AdamConfig) -> Self {
-        Self { config, steps: 0, moments: BTreeMap::new() }
+        Self { config, steps: 0, slower: None, moments: BTreeMap::new() }
+    }
+
+    /// The same optimiser, but parameters whose names begin with `prefix` learn at `factor` times the rate.
+    #[must_use]
+    pub fn with_slower(self, prefix: &'static str, factor: f32) -> Self {
+        Self { slower: Some((prefix, factor)), ..self }
     }
 
     /// Changes the step size from the next step on.
@@ -123,7 +131,7 @@ impl Adam {
         let norm = squares.iter().sum::<f64>().sqrt() as f32;
         let clip = self.config.max_norm.map_or(1.0, |max| (max / norm.max(f32::MIN_POSITIVE)).min(1.0));
         self.steps += 1;
-        let rule = Rule::new(&self.config, self.steps, clip);
+        let (rule, slower) = (Rule::new(&self.config, self.steps, clip), self.slower);
         work.par_iter_mut().for_each(|(name, parameter, gradient, [first, second])| {
             let decay =
                 if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
@@ -132,7 +140,10 @@ impl Adam {
                 let [size, slope] = [&*parameter, &*gradient].map(|numbers| sum_of_squares(numbers).sqrt() as f32);
                 (share * size.max(1e-3) / slope.max(f32::MIN_POSITIVE)).min(1.0)
             });
-            let rule = Rule { decay, clip: clip * adaptive, ..rule };
+            let mut rule = Rule { decay, clip: clip * adaptive, ..rule };
+            if let Some((_, factor)) = slower.filter(|(prefix, _)| name.starts_with(prefix)) {
+                rule.rate *= factor;
+            }
             if self.config.normalise_first {
                 update_normalised(parameter, gradient, first, second, rule);
             } else {

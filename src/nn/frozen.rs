@@ -4,7 +4,8 @@
 use pulp::Simd;
 
 use super::Activation;
-use super::kernels::activate;
+use super::kernels::{activate, vectorised_fn};
+use super::norm::LAYER_NORM_EPSILON;
 
 /// Rows that pass through a network together: two of the widest vectors.
 pub const PANEL: usize = 32;
@@ -46,7 +47,15 @@ fn grow(panel: &mut Vec<Feature>, features: usize) {
 #[derive(Clone, Debug)]
 pub struct FrozenMlp {
     layers: Vec<Layer>,
-    activation: Activation,
+}
+
+/// What follows the affine part of a layer.
+#[derive(Clone, Debug)]
+pub enum After {
+    /// An activation.
+    Activation(Activation),
+    /// Layer normalisation over a row's features, then an activation: [`super::norm::layer_norm`].
+    LayerNorm { gain: Vec<f32>, shift: Vec<f32>, activation: Activation },
 }
 
 /// Weights and biases in blocks of outputs, padded with zeros.
@@ -57,15 +66,24 @@ struct Layer {
     /// `[output / BLOCK, input]`
     weight: Vec<[f32; BLOCK]>,
     bias: Vec<[f32; BLOCK]>,
+    after: After,
 }
 
 impl FrozenMlp {
     /// A network of the given layers, weight `[input, output]` and bias `[output]` each; `activation` follows all but
     /// the last.
     pub fn new<'a>(layers: impl Iterator<Item = (&'a [f32], &'a [f32])>, activation: Activation) -> Self {
-        let layers: Vec<Layer> = layers.map(|(weight, bias)| Layer::new(weight, bias)).collect();
+        let hidden = layers.map(|(weight, bias)| (weight, bias, After::Activation(activation)));
+        let mut network = Self::of_layers(hidden);
+        network.layers.last_mut().expect("a layer").after = After::Activation(Activation::Identity);
+        network
+    }
+
+    /// A network of the given layers, each with what follows it.
+    pub fn of_layers<'a>(layers: impl Iterator<Item = (&'a [f32], &'a [f32], After)>) -> Self {
+        let layers: Vec<Layer> = layers.map(|(weight, bias, after)| Layer::new(weight, bias, after)).collect();
         assert!(!layers.is_empty(), "a network has layers");
-        Self { layers, activation }
+        Self { layers }
     }
 
     /// Input features.
@@ -86,18 +104,18 @@ impl FrozenMlp {
     /// The network's output for the [input](Panels::input).
     pub fn forward<'a>(&self, panels: &'a mut Panels) -> &'a [Feature] {
         let Panels { x, y } = panels;
-        let (head, hidden) = self.layers.split_last().expect("a network has layers");
-        for layer in hidden {
-            layer.forward(x, y, self.activation);
-            std::mem::swap(x, y);
+        for (i, layer) in self.layers.iter().enumerate() {
+            if i > 0 {
+                std::mem::swap(x, y);
+            }
+            layer.forward(x, y);
         }
-        head.forward(x, y, Activation::Identity);
-        &y[..head.output]
+        &y[..self.outputs()]
     }
 }
 
 impl Layer {
-    fn new(weight: &[f32], bias: &[f32]) -> Self {
+    fn new(weight: &[f32], bias: &[f32], after: After) -> Self {
         let (input, output) = (weight.len() / bias.len(), bias.len());
         let block =
             |row: &[f32], first: usize| std::array::from_fn(|o| row[..output].get(first + o).copied().unwrap_or(0.0));
@@ -107,6 +125,7 @@ impl Layer {
             output,
             weight: firsts.clone().flat_map(|o| weight.chunks_exact(output).map(move |row| block(row, o))).collect(),
             bias: firsts.map(|o| block(bias, o)).collect(),
+            after,
         }
     }
 
@@ -116,9 +135,38 @@ impl Layer {
         (0..self.input).flat_map(|i| (0..self.output).map(move |o| at(i, o))).collect()
     }
 
-    fn forward(&self, x: &[Feature], y: &mut Vec<Feature>, activation: Activation) {
+    fn forward(&self, x: &[Feature], y: &mut Vec<Feature>) {
         grow(y, self.bias.len() * BLOCK);
-        pulp::Arch::new().dispatch(Product { layer: self, x: &x[..self.input], y, activation });
+        let x = &x[..self.input];
+        match &self.after {
+            After::Activation(activation) => {
+                pulp::Arch::new().dispatch(Product { layer: self, x, y, activation: *activation });
+            }
+            After::LayerNorm { gain, shift, activation } => {
+                pulp::Arch::new().dispatch(Product { layer: self, x, y, activation: Activation::Identity });
+                layer_norm(&mut y[..self.output], gain, shift, *activation);
+            }
+        }
+    }
+}
+
+vectorised_fn! {
+    /// [`super::norm::layer_norm`] of each row of a panel, in place.
+    fn layer_norm(y: &'a mut [Feature], gain: &'a [f32], shift: &'a [f32], activation: Activation) {
+        let share = 1.0 / y.len() as f32;
+        let mut mean = [0.0; PANEL];
+        for Feature(y) in y.iter() {
+            (0..PANEL).for_each(|i| mean[i] += share * y[i]);
+        }
+        let mut variance = [0.0; PANEL];
+        for Feature(y) in y.iter() {
+            (0..PANEL).for_each(|i| variance[i] += share * (y[i] - mean[i]) * (y[i] - mean[i]));
+        }
+        let scale = variance.map(|variance| 1.0 / (variance + LAYER_NORM_EPSILON).sqrt());
+        for ((Feature(y), gain), shift) in y.iter_mut().zip(gain).zip(shift) {
+            (0..PANEL).for_each(|i| y[i] = gain * (y[i] - mean[i]) * scale[i] + shift);
+        }
+        activate(bytemuck::cast_slice_mut(y), activation);
     }
 }
 
@@ -182,14 +230,47 @@ fn sums<S: Simd, const OUTPUTS: usize>(
 mod tests {
     use super::*;
     use crate::nn::kernels::{DenseShape, dense};
+    use crate::nn::{Grad, Mlp, Parameters, device, tensor, values};
     use crate::rng;
+
+    /// The same answers as the network that was frozen: each layer normalised, with an activation after the last one, too.
+    #[test]
+    fn a_normalised_network_answers_as_before() {
+        let cpu = device();
+        let mut rng = rng::stream(1, "frozen");
+        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| rng::normal(&mut rng) as f32).collect() };
+        for output in [None, Some(13)] {
+            let mut networks = Mlp::tdmpc(&cpu, 2, 9, &[33, 24], output, &mut rng::stream(2, "frozen"));
+            for (_, parameter) in networks.parameters_mut() {
+                let numbers = values(parameter).iter().zip(draw(values(parameter).len()));
+                let moved: Vec<f32> = numbers.map(|(number, by)| number + 0.2 * by).collect();
+                parameter.copy_from(&moved);
+            }
+            let x = draw(PANEL * 9);
+            let expected = networks.forward(tensor(&cpu, x.clone(), (1, PANEL, 9)), Grad::Input);
+            for member in 0..2 {
+                let frozen = networks.frozen(member);
+                let mut panels = Panels::default();
+                for (i, feature) in panels.input(9).iter_mut().enumerate() {
+                    feature.0 = std::array::from_fn(|row| x[row * 9 + i]);
+                }
+                let y = frozen.forward(&mut panels);
+                for (o, y) in y.iter().enumerate() {
+                    for (row, y) in y.0.iter().enumerate() {
+                        let expected = expected[[member, row, o]];
+                        assert!((y - expected).abs() < 2e-5, "{member}, {row}, {o}: {y}, expected {expected}");
+                    }
+                }
+            }
+        }
+    }
 
     /// The same answers as layer by layer, for sizes that fill no block.
     #[test]
     fn a_panel_gets_the_answers_of_each_row() {
         let mut rng = rng::stream(0, "frozen");
         let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| rng::normal(&mut rng) as f32 * 0.3).collect() };
-        for activation in [Activation::Identity, Activation::Relu, Activation::Silu] {
+        for activation in [Activation::Identity, Activation::Relu, Activation::Silu, Activation::Mish] {
             let sizes = [7, 23, 40, 11];
             let layers: Vec<_> = sizes.windows(2).map(|s| (draw(s[0] * s[1]), draw(s[1]))).collect();
             let network = FrozenMlp::new(layers.iter().map(|(w, b)| (&w[..], &b[..])), activation);

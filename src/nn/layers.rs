@@ -4,6 +4,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
+use super::frozen::{After, FrozenMlp};
 use super::ops::{self, Grad, Tensor3, values, values_mut};
 use super::parameters::Parameters;
 use super::tape::TapeOps;
@@ -52,6 +53,8 @@ pub enum Init {
     /// Weights normal and truncated at two standard deviations, with standard deviation 1 / sqrt(n) after truncation; biases
     /// zero: as in DreamerV3.
     Lecun,
+    /// Weights normal with standard deviation 0.02, biases zero: as in TD-MPC2, where layers are normalised.
+    Small,
 }
 
 impl Init {
@@ -65,6 +68,7 @@ impl Init {
             _ if is_bias => 0.0,
             Self::TruncatedNormal => 0.5 * bound * rng::truncated_normal(rng),
             Self::Lecun => bound / TRUNCATED * rng::truncated_normal(rng),
+            Self::Small => 0.02 * rng::normal(rng),
         };
         (0..count).map(number).map(|x| x as f32).collect()
     }
@@ -133,6 +137,51 @@ impl Mlp {
         Self::new(cpu, &config, rng)
     }
 
+    /// Networks in TD-MPC2's manner: hidden layers have layer normalisation and Mish, weights are drawn by [`Init::Small`], and
+    /// an affine layer follows if there is an `output` size.
+    pub fn tdmpc(
+        cpu: &Cpu,
+        members: usize,
+        input: usize,
+        hidden: &[usize],
+        output: Option<usize>,
+        rng: &mut Rng,
+    ) -> Self {
+        let (norm, activation, init) = (Norm::Layer, Activation::Mish, Init::Small);
+        let hidden = hidden.to_vec();
+        Self::new(cpu, &MlpConfig { members, input, hidden, output, norm, activation, init }, rng)
+    }
+
+    /// The same networks with another activation after the last layer.
+    #[must_use]
+    pub fn ending_in(mut self, activation: Activation) -> Self {
+        self.layers.last_mut().expect("a layer").activation = activation;
+        self
+    }
+
+    /// Some of the networks, with tensors of their own.
+    pub fn some(&self, cpu: &Cpu, members: &[usize]) -> Self {
+        let taken = |parameter: &Tensor3| {
+            let &(all, rows, columns) = parameter.shape();
+            let own: Vec<&[f32]> = values(parameter).chunks_exact(values(parameter).len() / all).collect();
+            let numbers = members.iter().flat_map(|member| own[*member]).copied().collect();
+            super::tensor(cpu, numbers, (members.len(), rows, columns))
+        };
+        let layer = |layer: &Layer| Layer {
+            weight: taken(&layer.weight),
+            bias: taken(&layer.bias),
+            norm: match &layer.norm {
+                NormParameters::None => NormParameters::None,
+                NormParameters::Layer { gain, shift } => {
+                    NormParameters::Layer { gain: taken(gain), shift: taken(shift) }
+                }
+                NormParameters::Rms { gain } => NormParameters::Rms { gain: taken(gain) },
+            },
+            activation: layer.activation,
+        };
+        Self { layers: self.layers.iter().map(layer).collect() }
+    }
+
     /// Multiplies the weights of the last layer by `factor`: with 0, the output is the same for every input at first.
     pub fn scale_output(mut self, factor: f32) -> Self {
         let last = self.layers.last_mut().expect("a layer");
@@ -173,6 +222,25 @@ impl Mlp {
     pub fn member(&self, cpu: &Cpu, member: usize) -> Self {
         let layers = self.layers_of(member).map(|(weight, bias)| (weight.to_vec(), bias.to_vec())).collect();
         Self::from_layers(cpu, &[layers], self.layers[0].activation)
+    }
+
+    /// One of the networks for inference, with its normalisation.
+    ///
+    /// # Panics
+    /// If it is normalised by the root mean square.
+    pub(crate) fn frozen(&self, member: usize) -> FrozenMlp {
+        let affine = self.layers_of(member).zip(&self.layers);
+        FrozenMlp::of_layers(affine.map(|((weight, bias), layer)| {
+            let own = |parameter: &Tensor3| values(parameter)[member * bias.len()..][..bias.len()].to_vec();
+            let after = match &layer.norm {
+                NormParameters::None => After::Activation(layer.activation),
+                NormParameters::Layer { gain, shift } => {
+                    After::LayerNorm { gain: own(gain), shift: own(shift), activation: layer.activation }
+                }
+                NormParameters::Rms { .. } => panic!("root-mean-square normalisation has no fast path"),
+            };
+            (weight, bias, after)
+        }))
     }
 
     /// The outputs `[members, batch, output]` for `x` (`[members or 1, batch, input]`), whose tape they take over. An input

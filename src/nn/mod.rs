@@ -45,6 +45,8 @@ pub mod norm;
 pub mod ops;
 pub(crate) mod parameters;
 pub mod recurrent;
+pub mod simnorm;
+mod symlog_bins;
 pub mod tape;
 mod tensors;
 pub mod two_hot;
@@ -63,6 +65,7 @@ pub use ops::{Grad, Tensor2, Tensor3, values, values_mut};
 pub(crate) use parameters::parameters_of_fields;
 pub use parameters::{Parameters, copy_parameters, polyak};
 pub use recurrent::BlockDense;
+pub use symlog_bins::SymlogBins;
 pub use tape::TapeOps;
 pub use two_hot::SymexpBins;
 

@@ -13,10 +13,12 @@
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
-use super::kernels::{Activation, silu, silu_slope, vectorised_fn};
+use super::kernels::{Activation, mish, mish_slope, silu, silu_slope, vectorised_fn};
 use super::ops::{Grad, Tensor3, take, values};
 use super::parameters::Parameters;
 use super::tape::TapeOps;
+
+pub(crate) const LAYER_NORM_EPSILON: f32 = 1e-5;
 
 /// Layer normalisation (Ba et al. 2016), then the activation:
 /// `activation(gain (x - mean) / sqrt(variance + 1e-5) + shift)`; x `[members, batch, features]`, gain and shift
@@ -29,7 +31,7 @@ pub fn layer_norm<T: Tape<f32, Cpu>>(
     activation: Activation,
     grad: Grad,
 ) -> Tensor3<T> {
-    normalised(x, gain, Some(shift), Rule { centred: true, epsilon: 1e-5, activation }, grad)
+    normalised(x, gain, Some(shift), Rule { centred: true, epsilon: LAYER_NORM_EPSILON, activation }, grad)
 }
 
 /// Root-mean-square normalisation (Zhang & Sennrich 2019), then the activation:
@@ -158,6 +160,7 @@ vectorised_fn! {
             Activation::Identity => forward_rows(y, statistics, x, gain, shift, rule, |z| z),
             Activation::Relu => forward_rows(y, statistics, x, gain, shift, rule, |z| z.max(0.0)),
             Activation::Silu => forward_rows(y, statistics, x, gain, shift, rule, silu),
+            Activation::Mish => forward_rows(y, statistics, x, gain, shift, rule, mish),
         }
     }
 }
@@ -211,6 +214,7 @@ vectorised_fn! {
                 Activation::Identity => pairs.for_each(|((g, dy), _)| *g = *dy),
                 Activation::Relu => pairs.for_each(|((g, dy), z)| *g = if z > 0.0 { *dy } else { 0.0 }),
                 Activation::Silu => pairs.for_each(|((g, dy), z)| *g = dy * silu_slope(z)),
+                Activation::Mish => pairs.for_each(|((g, dy), z)| *g = dy * mish_slope(z)),
             }
             for ((d_gain, g), x) in d_gain.iter_mut().zip(&g).zip(&normal) {
                 *d_gain += g * x;

@@ -61,8 +61,9 @@ pub fn dense<T: Tape<f32, Cpu>>(
     let shape = DenseShape { members, batch, input, output, shared_input: x_members == 1 };
 
     let mut y = vec![0.0; members * batch * output];
-    // The gradient of a ReLU follows from its result, that of a SiLU does not.
-    let mut before = (T::OWNS_TAPE && activation == Activation::Silu).then(|| vec![0.0; y.len()]);
+    // The gradient of a ReLU follows from its result, that of a SiLU or Mish does not.
+    let smooth = matches!(activation, Activation::Silu | Activation::Mish);
+    let mut before = (T::OWNS_TAPE && smooth).then(|| vec![0.0; y.len()]);
     kernels::dense(&mut y, before.as_deref_mut(), values(&x), values(w), values(b), shape, activation);
     let y = x.device().tensor_from_vec(y, (members, batch, output));
 
@@ -198,6 +199,29 @@ pub fn scale_rows<T: Tape<f32, Cpu>>(x: Tensor3<T>, factors: &[f32]) -> Tensor3<
         tape.add_backward_op(move |gradients| {
             let dy = scaled(&take(gradients, &y)?);
             gradients.get_or_alloc_mut(&x)?.iter_mut().zip(dy).for_each(|(dx, dy)| *dx += dy);
+            Ok(())
+        });
+    }
+    y.put_tape(tape)
+}
+
+/// The mean over the networks, row by row: `[members, batch, features]` becomes `[1, batch, features]`.
+pub fn mean_of_members<T: Tape<f32, Cpu>>(x: Tensor3<T>) -> Tensor3<T> {
+    let (x, mut tape) = x.split_tape();
+    let &(members, batch, features) = x.shape();
+    let share = 1.0 / members as f32;
+    let mut mean = vec![0.0; batch * features];
+    for of_member in values(&x).chunks_exact(batch * features) {
+        mean.iter_mut().zip(of_member).for_each(|(mean, x)| *mean += share * x);
+    }
+    let y = x.device().tensor_from_vec(mean, (1, batch, features));
+    if T::OWNS_TAPE {
+        let y = y.clone();
+        tape.add_backward_op(move |gradients| {
+            let dy = take(gradients, &y)?;
+            for dx in gradients.get_or_alloc_mut(&x)?.chunks_exact_mut(batch * features) {
+                dx.iter_mut().zip(&dy).for_each(|(dx, dy)| *dx += share * dy);
+            }
             Ok(())
         });
     }

@@ -15,6 +15,17 @@ pub trait Parameters {
     fn parameters_mut(&mut self) -> Vec<(String, &mut Tensor3)>;
 }
 
+/// A part that not every module has.
+impl<P: Parameters> Parameters for Option<P> {
+    fn parameters(&self) -> Vec<(String, &Tensor3)> {
+        self.as_ref().map_or_else(Vec::new, Parameters::parameters)
+    }
+
+    fn parameters_mut(&mut self) -> Vec<(String, &mut Tensor3)> {
+        self.as_mut().map_or_else(Vec::new, Parameters::parameters_mut)
+    }
+}
+
 /// Polyak averaging, by which a target network follows its source: `target <- (1 - rate) target + rate source`.
 #[doc(alias = "target network")]
 #[doc(alias = "EMA")]

@@ -52,6 +52,11 @@ pub trait TapeOps: Tape<f32, Cpu> + Sized {
         self.record(x, |x| ops::scale_rows(x, factors))
     }
 
+    /// [`ops::mean_of_members`]: `[1, batch, features]`.
+    fn mean_of_members(&mut self, x: &Tensor3) -> Tensor3 {
+        self.record(x, ops::mean_of_members)
+    }
+
     /// [`ops::squared_distance`]: of each row from the same row of `target`, `[members, batch, 1]`.
     fn squared_distance(&mut self, x: &Tensor3, target: &Tensor3) -> Tensor3 {
         self.record(x, |x| ops::squared_distance(x, target))

@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Cem, CemConfig, Gradient, GradientConfig, Hybrid, HybridConfig, Icem, IcemConfig, MakePlanner, Mppi, MppiConfig,
-    Planner, RandomShooting, ShootingConfig,
+    Cem, CemConfig, Gradient, GradientConfig, GuidedConfig, GuidedMppi, Hybrid, HybridConfig, Icem, IcemConfig,
+    MakePlanner, Mppi, MppiConfig, Planner, RandomShooting, ShootingConfig,
 };
 use crate::settings::ranges;
 
@@ -28,6 +28,8 @@ pub enum PlannerConfig {
     Icem(IcemConfig),
     /// Model predictive path integral control.
     Mppi(MppiConfig),
+    /// MPPI over elites, guided by a policy's proposals.
+    Guided(GuidedConfig),
     /// Gradient ascent from several starts (gradient shooting).
     Gradient(GradientConfig),
     /// iCEM, refined by gradient ascent.
@@ -42,6 +44,7 @@ impl PlannerConfig {
             PlannerConfig::Cem(config) => Box::new(Cem::new(config.clone(), action_size)),
             PlannerConfig::Icem(config) => Box::new(Icem::new(config.clone(), action_size)),
             PlannerConfig::Mppi(config) => Box::new(Mppi::new(config.clone(), action_size)),
+            PlannerConfig::Guided(config) => Box::new(GuidedMppi::new(config.clone(), action_size)),
             PlannerConfig::Gradient(config) => Box::new(Gradient::new(config.clone(), action_size)),
             PlannerConfig::Hybrid(config) => Box::new(Hybrid::new(config.clone(), action_size)),
         }
@@ -54,6 +57,7 @@ impl PlannerConfig {
             PlannerConfig::Cem(config) => config.horizon,
             PlannerConfig::Icem(config) => config.horizon,
             PlannerConfig::Mppi(config) => config.horizon,
+            PlannerConfig::Guided(config) => config.horizon,
             PlannerConfig::Gradient(config) => config.horizon,
             PlannerConfig::Hybrid(config) => config.icem.horizon,
         }
@@ -67,6 +71,7 @@ impl PlannerConfig {
             PlannerConfig::Cem(config) => config.population,
             PlannerConfig::Icem(config) => of_icem(config),
             PlannerConfig::Mppi(config) => config.population,
+            PlannerConfig::Guided(config) => config.population,
             PlannerConfig::Gradient(config) => config.starts,
             PlannerConfig::Hybrid(config) => of_icem(&config.icem),
         }
@@ -78,6 +83,7 @@ ranges!(enum PlannerConfig {
     "cem" Cem: Nested,
     "icem" Icem: Nested,
     "mppi" Mppi: Nested,
+    "guided" Guided: Nested,
     "gradient" Gradient: Nested,
     "hybrid" Hybrid: Nested,
 });

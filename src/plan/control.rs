@@ -150,6 +150,14 @@ impl Objective for Repeated<'_> {
         });
         (returns, of_actions.collect())
     }
+
+    fn proposals(&mut self, count: usize, like: &ActionSequences) -> ActionSequences {
+        let ActionSequences { horizon, actions, .. } = *like;
+        let proposed = self.objective.proposals(count, &ActionSequences::new(horizon * self.action_repeat, actions));
+        // The first of the steps for which an action is held.
+        let held = proposed.values.chunks_exact(actions).step_by(self.action_repeat);
+        ActionSequences { values: held.flatten().copied().collect(), ..like.clone() }
+    }
 }
 
 fn in_control_steps(sequences: &ActionSequences, action_repeat: usize) -> ActionSequences {

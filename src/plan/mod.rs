@@ -11,6 +11,7 @@
 //! | [`Cem`] | the cross-entropy method, as in PETS |
 //! | [`Icem`] | CEM with coloured noise and a memory |
 //! | [`Mppi`] | model predictive path integral control: an average of all samples, weighted by exp(return) |
+//! | [`GuidedMppi`] | MPPI over the best candidates, among them a policy's proposals, as in TD-MPC2 |
 //! | [`Gradient`] | gradient ascent on the actions (gradient shooting) |
 //! | [`Hybrid`] | iCEM, refined by gradient ascent |
 //!
@@ -40,6 +41,7 @@ mod cem;
 mod config;
 mod control;
 mod gradient;
+mod guided;
 mod hybrid;
 mod icem;
 mod mppi;
@@ -50,6 +52,7 @@ pub use cem::{Cem, CemConfig};
 pub use config::PlannerConfig;
 pub use control::{ControlConfig, RecedingHorizon};
 pub use gradient::{Gradient, GradientConfig};
+pub use guided::{GuidedConfig, GuidedMppi};
 pub use hybrid::{Hybrid, HybridConfig};
 pub use icem::{Icem, IcemConfig};
 pub use mppi::{Mppi, MppiConfig};
@@ -119,6 +122,12 @@ pub trait Objective {
         let differences = self.returns(&around);
         let slopes = differences.chunks(2).map(|pair| (pair[0] - pair[1]) / (2.0 * STEP)).collect();
         (self.returns(sequences), slopes)
+    }
+
+    /// Up to `count` sequences worth trying, of the horizon and action size of the empty batch `like`: those of a learned
+    /// policy, for example. The default knows none.
+    fn proposals(&mut self, _count: usize, like: &ActionSequences) -> ActionSequences {
+        like.clone()
     }
 }
 

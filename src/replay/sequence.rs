@@ -139,12 +139,44 @@ impl SequenceReplay {
     /// If the buffer holds fewer than `length` time steps.
     pub fn sample(&self, sequences: usize, length: usize, rng: &mut Rng) -> SequenceBatch {
         assert!(self.len() >= length && length > 0, "enough to draw from");
+        let starts: Vec<usize> = (0..sequences).map(|_| rng.random_range(0..=self.len() - length)).collect();
+        self.at(&starts, length)
+    }
+
+    /// Samples subsequences of `length` time steps that lie within an episode each; the current episode's are among them.
+    /// `None` if no episode is that long.
+    pub fn sample_within_episodes(&self, sequences: usize, length: usize, rng: &mut Rng) -> Option<SequenceBatch> {
+        /// Attempts before all starts are looked through: most of them lead to a whole subsequence, unless episodes are short.
+        const ATTEMPTS: usize = 100;
+        let starts = (self.len() + 1).checked_sub(length).filter(|starts| *starts > 0 && length > 0)?;
+        let within = |start: &usize| !(start + 1..start + length).any(|i| self.row(i)[self.width() - 3] > 0.5);
+        let mut all: Option<Vec<usize>> = None;
+        let draw = |_| {
+            if all.is_none() {
+                let drawn = (0..ATTEMPTS).map(|_| rng.random_range(0..starts)).find(within);
+                if drawn.is_some() {
+                    return drawn;
+                }
+            }
+            let all = all.get_or_insert_with(|| (0..starts).filter(within).collect());
+            (!all.is_empty()).then(|| all[rng.random_range(0..all.len())])
+        };
+        let starts: Vec<usize> = (0..sequences).map(draw).collect::<Option<_>>()?;
+        Some(self.at(&starts, length))
+    }
+
+    /// The time step `i`, counted from the oldest.
+    fn row(&self, i: usize) -> &[f32] {
+        &self.rows[(self.oldest + i) % self.len() * self.width()..][..self.width()]
+    }
+
+    /// The subsequences that start at these time steps.
+    fn at(&self, starts: &[usize], length: usize) -> SequenceBatch {
         let (count, width) = (self.len(), self.width());
-        let starts: Vec<usize> = (0..sequences).map(|_| rng.random_range(0..=count - length)).collect();
-        let row = |i: usize| &self.rows[(self.oldest + i) % count * width..][..width];
-        let mut batch = SequenceBatch { sequences, length, ..SequenceBatch::default() };
+        let row = |i: usize| self.row(i);
+        let mut batch = SequenceBatch { sequences: starts.len(), length, ..SequenceBatch::default() };
         for t in 0..length {
-            for start in &starts {
+            for start in starts {
                 let (obs, rest) = row(start + t).split_at(self.observation_size);
                 let (action, rest) = rest.split_at(self.action_size);
                 let [reward, first, last, terminal] = rest else { unreachable!("four numbers") };

@@ -285,8 +285,9 @@ fn forged_checkpoints_are_used_or_refused() {
 /// Accidents: bits that flip, ends that are missing, blocks that are zero or another file's. What they change is told.
 #[test]
 fn damaged_checkpoints_are_refused() {
-    let runs = ["small-sac", "small-pets", "small-dreamer"].map(|method| begun(&small(method, 0)));
-    let others = ["small-sac", "small-pets", "small-dreamer"].map(|method| begun(&small(method, 1)));
+    let methods = ["small-sac", "small-pets", "small-dreamer", "small-tdmpc2"];
+    let runs = methods.map(|method| begun(&small(method, 0)));
+    let others = methods.map(|method| begun(&small(method, 1)));
     let read = |folder: &TempDir, file: &str| fs::read(folder.path().join(file)).expect("a checkpoint");
     let path = tempfile::tempdir().expect("a folder").keep().join("damaged.safetensors");
     let damage = prop_oneof![
@@ -296,7 +297,7 @@ fn damaged_checkpoints_are_refused() {
         2 => any::<(Index, Index)>().prop_map(|(from, to)| Damage::Splice(from, to)),
     ];
     let counts = [const { Cell::new(0) }; 2];
-    let checked = runner(300).run(&(0..3_usize, any::<bool>(), damage), |(run, state, damage)| {
+    let checked = runner(300).run(&(0..methods.len(), any::<bool>(), damage), |(run, state, damage)| {
         let file = if state { STATE } else { WEIGHTS };
         let whole = read(&runs[run], file);
         fs::write(&path, damage.of(whole.clone(), &read(&others[run], file))).expect("a writable folder");

@@ -16,7 +16,7 @@ use toml::{Table, Value};
 use super::{brief, runner, timed};
 
 /// A preset of each method that learns or plans, so small that a few steps take milliseconds.
-pub(super) const SMALL: [(&str, &str); 5] = [
+pub(super) const SMALL: [(&str, &str); 6] = [
     (
         "small-sac",
         "base = 'sac'
@@ -75,6 +75,26 @@ pub(super) const SMALL: [(&str, &str); 5] = [
          units = 8
          layers = 1
          horizon = 3",
+    ),
+    (
+        "small-tdmpc2",
+        "base = 'tdmpc2'
+         evaluation_episodes = 1
+         env.horizon = 5
+         [tdmpc2]
+         batch = 2
+         warm_up = 10
+         [tdmpc2.model]
+         latent = 8
+         group = 4
+         encoder = 8
+         units = 8
+         bins = 15
+         [tdmpc2.planner]
+         population = 8
+         proposals = 2
+         elites = 2
+         iterations = 2",
     ),
     (
         "small-planet",
@@ -226,6 +246,9 @@ fn numbers_must_fit_together() {
         ("sac", "sac.hidden = [4096, 4096]\nsac.critics = 32", "too many weights"),
         ("dreamer", "dreamer.replay = 20", "`dreamer`: `replay` must hold at least `length` time steps"),
         ("dreamer", "dreamer.train_ratio = 1e6", "`dreamer`: `train_ratio` must not exceed"),
+        ("tdmpc2", "tdmpc2.model.group = 7", "`tdmpc2.model`: `group` must divide `latent`"),
+        ("tdmpc2", "tdmpc2.planner.elites = 1000", "`tdmpc2.planner`: `elites` must not exceed `population`"),
+        ("tdmpc2", "tdmpc2.replay = 3", "`tdmpc2`: `replay` must hold more decisions than `horizon`"),
         ("dreamer", "dreamer.world.bins = 4", "`dreamer.world`: `bins` must be odd"),
     ] {
         let problem = config_of(method, text).expect_err(text).to_string();
@@ -236,7 +259,7 @@ fn numbers_must_fit_together() {
 /// Another planner takes the place of the preset's; the same one keeps what the file does not change.
 #[test]
 fn a_file_can_choose_any_planner() {
-    let kinds = ["shooting", "cem", "icem", "mppi", "gradient", "hybrid"];
+    let kinds = ["shooting", "cem", "icem", "mppi", "guided", "gradient", "hybrid"];
     for (method, agent) in [("pets", "pets"), ("oracle", "oracle"), ("planet", "dreamer")] {
         for kind in kinds {
             let horizon = if kind == "hybrid" { "icem.horizon" } else { "horizon" };

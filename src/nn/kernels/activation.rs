@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::math::{silu, silu_slope};
+use super::math::{mish, mish_slope, silu, silu_slope};
 use super::vectorised_fn;
 
 /// The activation after a layer's affine part.
@@ -16,6 +16,8 @@ pub enum Activation {
     Relu,
     /// x sigmoid(x), also called swish. It is smooth, so that a learned model has smooth gradients.
     Silu,
+    /// x tanh(ln(1 + exp(x))) (Misra 2020): smooth as SiLU is, TD-MPC2's choice.
+    Mish,
 }
 
 vectorised_fn! {
@@ -25,6 +27,7 @@ vectorised_fn! {
             Activation::Identity => for_rows(y, b, |x| x),
             Activation::Relu => for_rows(y, b, |x| x.max(0.0)),
             Activation::Silu => for_rows(y, b, silu),
+            Activation::Mish => for_rows(y, b, mish),
         }
     }
 }
@@ -51,6 +54,7 @@ pub(crate) fn activate(y: &mut [f32], activation: Activation) {
         Activation::Identity => {}
         Activation::Relu => y.iter_mut().for_each(|y| *y = y.max(0.0)),
         Activation::Silu => y.iter_mut().for_each(|y| *y = silu(*y)),
+        Activation::Mish => y.iter_mut().for_each(|y| *y = mish(*y)),
     }
 }
 
@@ -70,6 +74,7 @@ vectorised_fn! {
             Activation::Identity => {}
             Activation::Relu => pairs.for_each(|(dy, z)| *dy = if *z > 0.0 { *dy } else { 0.0 }),
             Activation::Silu => pairs.for_each(|(dy, z)| *dy *= silu_slope(*z)),
+            Activation::Mish => pairs.for_each(|(dy, z)| *dy *= mish_slope(*z)),
         }
     }
 }

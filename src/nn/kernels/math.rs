@@ -57,6 +57,29 @@ pub(crate) fn silu_slope(x: f32) -> f32 {
     s * (1.0 + x * (1.0 - s))
 }
 
+/// `x tanh(softplus(x))`, with one exponential: for e = exp(x), tanh(ln(1 + e)) = q / (q + 2) with q = e (e + 2).
+#[inline(always)]
+pub(crate) fn mish(x: f32) -> f32 {
+    x * mish_factor(exp(x.min(MISH_IS_IDENTITY)))
+}
+
+#[inline(always)]
+pub(crate) fn mish_slope(x: f32) -> f32 {
+    let e = exp(x.min(MISH_IS_IDENTITY));
+    let factor = mish_factor(e);
+    factor + x * (1.0 - factor * factor) * (e / (1.0 + e))
+}
+
+/// From here on, [`mish`] is the identity to the last bit, and the square of the exponential is still finite.
+const MISH_IS_IDENTITY: f32 = 20.0;
+
+/// tanh(ln(1 + e)).
+#[inline(always)]
+fn mish_factor(e: f32) -> f32 {
+    let q = e * (e + 2.0);
+    q / (q + 2.0)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -73,6 +96,13 @@ mod tests {
             let x = i as f32 / 10.0;
             let truth = f64::from(x).exp().ln_1p();
             assert!((f64::from(softplus(x)) - truth).abs() < 2e-7 * truth.max(1.0), "softplus({x})");
+        }
+        for i in -4000..=4000 {
+            let x = i as f32 / 100.0;
+            let truth = |x: f64| x * x.exp().ln_1p().tanh();
+            let (y, difference) = (truth(x.into()), (truth(f64::from(x) + 1e-4) - truth(f64::from(x) - 1e-4)) / 2e-4);
+            assert!((f64::from(mish(x)) - y).abs() < 1e-6 * y.abs().max(1.0), "mish({x})");
+            assert!((f64::from(mish_slope(x)) - difference).abs() < 2e-6, "the slope of mish({x})");
         }
         assert!(exp(-1e9) > 0.0 && exp(1e9).is_finite());
         assert!((sigmoid(0.0) - 0.5).abs() < 1e-7 && sigmoid(-100.0) < 1e-30 && sigmoid(100.0) == 1.0);

@@ -4,7 +4,9 @@ use toml::Table;
 
 use super::Registry;
 use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, SharedReward, completed, in_range};
-use crate::agent::{Dreamer, DreamerConfig, Method, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig};
+use crate::agent::{
+    Dreamer, DreamerConfig, Method, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, TdMpc2, TdMpc2Config,
+};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::settings::{Ranges, choices};
@@ -103,6 +105,9 @@ pub(super) fn register(registry: Registry) -> Registry {
     let pets = AgentEntry::new("pets", true, |context, config: PetsConfig| {
         Ok(Method::learner(Pets::new(context.spec, context.known_reward()?, config, context.seed)?))
     });
+    let tdmpc2 = AgentEntry::new("tdmpc2", true, |context, config: TdMpc2Config| {
+        Ok(Method::learner(TdMpc2::new(context.spec, config, context.seed)?))
+    });
     let scripted = AgentEntry::new("scripted", false, |context, NoOptions {}| context.scripted());
     registry
         .add_agent(oracle)
@@ -110,5 +115,6 @@ pub(super) fn register(registry: Registry) -> Registry {
         .policy("random", |context, NoOptions {}| Ok(Random::new(context.spec, context.seed)))
         .add_agent(sac.with_ranges::<SacConfig>())
         .add_agent(dreamer.with_ranges::<DreamerConfig>())
+        .add_agent(tdmpc2.with_ranges::<TdMpc2Config>())
         .add_agent(pets.with_ranges::<PetsConfig>())
 }

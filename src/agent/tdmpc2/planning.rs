@@ -1,0 +1,103 @@
+//! Planning in latent space (Hansen et al. 2024, section 3.2): what the planner maximises, and a planner for each environment.
+
+use super::TdMpc2Config;
+use super::decision::Held;
+use crate::model::implicit::{FrozenModel, ImplicitModel, normals};
+use crate::nn::values;
+use crate::plan::{ActionSequences, GuidedMppi, Objective, PlanObserver, Planner};
+use crate::rng::{self, Rng};
+
+use rand::RngExt;
+
+/// The return of action sequences from one latent state, and the policy's proposals.
+pub(super) struct LatentReturns<'a> {
+    pub model: &'a FrozenModel,
+    pub z: &'a [f32],
+    pub critics: usize,
+    pub discount: f32,
+    pub rng: Rng,
+}
+
+impl Objective for LatentReturns<'_> {
+    /// Each call draws two critics, and an action for the last state of each sequence.
+    fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
+        let noise = normals(sequences.count() * sequences.actions, &mut self.rng);
+        let pair = two_of(self.critics, &mut self.rng);
+        self.model.returns(self.z, &sequences.values, sequences.horizon, &noise, pair, self.discount)
+    }
+
+    fn proposals(&mut self, count: usize, like: &ActionSequences) -> ActionSequences {
+        let noise = normals(count * like.horizon * like.actions, &mut self.rng);
+        ActionSequences { values: self.model.policy_sequences(self.z, like.horizon, &noise), ..like.clone() }
+    }
+}
+
+/// Two different members of an ensemble.
+pub(super) fn two_of(members: usize, rng: &mut Rng) -> [usize; 2] {
+    let first = rng.random_range(0..members);
+    let other = rng.random_range(0..members - 1);
+    [first, if other < first { other } else { other + 1 }]
+}
+
+/// What a planner plans in.
+#[derive(Clone, Copy)]
+pub(super) struct Imagined<'a> {
+    pub model: &'a ImplicitModel,
+    pub frozen: &'a FrozenModel,
+    pub discount: f32,
+}
+
+/// A planner with its own random numbers, for one environment.
+pub(super) struct Pilot {
+    planner: GuidedMppi,
+    /// The action that is held.
+    pub held: Held,
+    action_repeat: usize,
+    pub rng: Rng,
+}
+
+impl Pilot {
+    pub fn new(config: &TdMpc2Config, action_size: usize, rng: Rng) -> Self {
+        let planner = GuidedMppi::new(config.planner.clone(), action_size);
+        Self { planner, held: Held::default(), action_repeat: config.action_repeat, rng }
+    }
+
+    /// The planner of a slot, which depends on nothing but the slot's index.
+    pub fn of_slot(config: &TdMpc2Config, action_size: usize, index: usize) -> Self {
+        Self::new(config, action_size, rng::stream(index as u64, "tdmpc2 seat"))
+    }
+
+    /// A new episode begins.
+    pub fn reset(&mut self) {
+        self.planner.reset();
+        self.held.reset();
+    }
+
+    /// The next action from `obs`; plans when the last one has been held long enough. To `explore`, noise of the plan's own
+    /// deviation is added.
+    pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
+        let Self { planner, held, action_repeat, rng } = self;
+        held.next(*action_repeat, || plan(planner, rng, world, obs, explore, observer))
+    }
+}
+
+fn plan(
+    planner: &mut GuidedMppi,
+    rng: &mut Rng,
+    world: Imagined,
+    obs: &[f32],
+    explore: bool,
+    observer: &mut PlanObserver,
+) -> Vec<f32> {
+    let Imagined { model, frozen, discount } = world;
+    let z = model.encode(obs);
+    let critics = model.config().critics;
+    let mut objective = LatentReturns { model: frozen, z: values(&z), critics, discount, rng: rng::fork(rng) };
+    let plan = planner.plan(&mut objective, observer, rng);
+    let mut noise = || if explore { rng::normal(rng) } else { 0.0 };
+    let numbers = plan.actions.iter().zip(planner.deviation());
+    let action = numbers.map(|(a, deviation)| (f64::from(*a) + deviation * noise()).clamp(-1.0, 1.0) as f32);
+    let action = action.collect();
+    planner.shift(1);
+    action
+}

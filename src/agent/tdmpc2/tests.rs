@@ -1,0 +1,163 @@
+use dfdx::prelude::*;
+use dfdx::tensor::Gradients;
+
+use super::*;
+use crate::env::Feature;
+use crate::model::ImplicitConfig;
+use crate::nn::two_hot::symexp;
+use crate::nn::{Parameters, TapeOps, Tensor3, device, ops, values, values_mut};
+use crate::replay::SequenceBatch;
+
+const O: usize = 4;
+const A: usize = 2;
+const SIZE: usize = 8;
+
+/// The networks of the end-to-end reference: weight k is 0.4 sin(1.3 k + 0.5), biases 0, gains 1; the target critics have 0.9
+/// times every number of the critics.
+fn reference() -> Networks {
+    let spec = Spec::new("reference", (0..O).map(|i| Feature::new(i.to_string())), A, 100, 0.05);
+    let model = ImplicitConfig {
+        latent: SIZE,
+        encoder: SIZE,
+        units: SIZE,
+        critics: 3,
+        bins: 101,
+        bin_limit: 10.0,
+        ..ImplicitConfig::default()
+    };
+    let config = TdMpc2Config { model, ..TdMpc2Config::default() };
+    let mut networks = Networks::new(&spec, &config, &mut rng::stream(0, "reference"));
+    let mut k = 0;
+    // The reference counts critic by critic, and stores matrices `[output, input]`.
+    let mut fill = |name: &str, parameter: &mut Tensor3, member: usize| {
+        let &(members, inputs, outputs) = parameter.shape();
+        let numbers = &mut values_mut(parameter)[member * inputs * outputs..][..inputs * outputs];
+        assert!(member < members);
+        if name.ends_with("weight") {
+            for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
+                numbers[i * outputs + o] = (0.4 * (1.3 * f64::from(k) + 0.5).sin()) as f32;
+                k += 1;
+            }
+        } else {
+            numbers.fill(if name.ends_with("gain") { 1.0 } else { 0.0 });
+        }
+    };
+    let Networks { model, policy, target, .. } = &mut networks;
+    for part in ["encoder.", "dynamics.", "reward."] {
+        let own = model.parameters_mut().into_iter().filter(|(name, _)| name.starts_with(part));
+        own.for_each(|(name, parameter)| fill(&name, parameter, 0));
+    }
+    policy.parameters_mut().into_iter().for_each(|(name, parameter)| fill(&name, parameter, 0));
+    for member in 0..3 {
+        let own = model.parameters_mut().into_iter().filter(|(name, _)| name.starts_with("critics."));
+        own.for_each(|(name, parameter)| fill(&name, parameter, member));
+    }
+    assert_eq!(k, 4272);
+    copy_parameters(target, model.critics());
+    for (_, parameter) in target.parameters_mut() {
+        values_mut(parameter).iter_mut().for_each(|number| *number *= 0.9);
+    }
+    networks
+}
+
+fn batch() -> SequenceBatch {
+    let (sequences, length) = (2, 3);
+    let numbers = |count: usize, f: fn(f64) -> f64| (0..count).map(|j| f(j as f64) as f32).collect::<Vec<f32>>();
+    let mut rewards = vec![0.0; sequences];
+    rewards.extend(numbers(sequences * (length - 1), |j| 0.5 + 0.5 * (1.7 * j).cos()));
+    let mut actions = numbers(sequences * (length - 1) * A, |j| (2.1 * j + 1.0).sin());
+    actions.extend([0.0; 2 * A]);
+    SequenceBatch {
+        sequences,
+        length,
+        // The networks read the symlog of observations.
+        obs: numbers(sequences * length * O, |j| (0.9 * j).cos()).into_iter().map(symexp).collect(),
+        actions,
+        rewards,
+        first: vec![false; sequences * length],
+        last: vec![false; sequences * length],
+        terminal: vec![false; sequences * length],
+    }
+}
+
+fn near(what: &str, found: f32, expected: f64) {
+    let error = (f64::from(found) - expected).abs();
+    assert!(error < 2e-5 * expected.abs().max(1.0), "{what}: {found}, expected {expected}");
+}
+
+fn norm<'a>(gradients: &Gradients<f32, Cpu>, parameters: impl Iterator<Item = &'a Tensor3>) -> f32 {
+    let squares = parameters.map(|parameter| gradients.get(parameter).as_vec().iter().map(|g| g * g).sum::<f32>());
+    squares.sum::<f32>().sqrt()
+}
+
+/// Numbers computed in float64 from the published code: latent states, value targets, losses and gradients of one update, with
+/// all noise 0.3 and the critics 1 and 2.
+#[test]
+fn an_update_is_the_references() {
+    let networks = reference();
+    let Networks { model, policy, target, .. } = &networks;
+    let (batch, noise) = (batch(), [0.3; 12]);
+    let pair = [0, 1];
+    let expected = [0.022_674, 0.188_015, 0.133_075, 0.023_650, 0.232_114, 0.100_721, 0.026_185, 0.273_565];
+    let z = model.encode(&batch.obs);
+    values(&z).iter().zip(expected).for_each(|(z, expected)| near("z", *z, expected));
+
+    let encoded = NoneTape.rows(&z, 2, 4);
+    let actions = policy.sample_on(&mut NoneTape, &encoded, &noise[..8]).0;
+    let q = model.values(&target.some(&device(), &pair), &encoded, &actions);
+    let targets = update::bootstrapped(&batch, &q, 0.95);
+    targets.iter().zip([0.981_567, 0.452_613, 0.030_633, 0.663_528]).for_each(|(y, expected)| near("y", *y, expected));
+
+    let mut tape = OwnedTape::default();
+    let loss = model.loss(&mut tape, &batch, &encoded, &targets);
+    near("consistency", ops::mean(&loss.consistency), 0.017_519);
+    near("reward", ops::mean(&loss.reward), 3.555_890);
+    near("value", ops::mean(&loss.value), 3.554_769);
+    let total = ops::total(tape, &loss.weighted(model.config()));
+    near("total", total.array(), 1.061_453);
+    let gradients = total.backward();
+    let of = |part: &'static str| {
+        let own = model.parameters().into_iter().filter(move |(name, _)| name.starts_with(part));
+        norm(&gradients, own.map(|(_, parameter)| parameter))
+    };
+    for (part, expected) in [
+        ("encoder", 0.227_024),
+        ("dynamics", 3.295_909),
+        ("reward", 0.106_624),
+        ("critics", 0.059_289),
+        ("", 3.305_970),
+    ] {
+        near(part, of(part), expected);
+    }
+
+    let mut tape = OwnedTape::default();
+    let latents = NoneTape.stack(&loss.latents);
+    let mut scale = RunningScale::default();
+    let loss = networks.climb(&mut tape, &latents, &noise, pair, 2, 1e-4, &mut scale);
+    near("policy", ops::mean(&loss.climb) + ops::mean(&loss.entropy), -0.000_994);
+    let gradients = ops::total(tape, &[(1.0, loss.climb), (1.0, loss.entropy)]).backward();
+    near("policy's gradient", norm(&gradients, policy.parameters().into_iter().map(|(_, p)| p)), 0.310_840);
+}
+
+/// The values that a pair of critics are asked for are never those of one critic twice, and all pairs are drawn.
+#[test]
+fn two_critics_are_two() {
+    let mut rng = rng::stream(0, "pairs");
+    let pairs: std::collections::BTreeSet<[usize; 2]> = (0..500).map(|_| planning::two_of(3, &mut rng)).collect();
+    assert_eq!(pairs.len(), 6);
+    assert!(pairs.iter().all(|[one, other]| one != other));
+}
+
+/// No gradient flows from the policy's loss into the critics, nor into the model.
+#[test]
+fn the_policy_leaves_the_model_alone() {
+    let networks = reference();
+    let z = networks.model.encode(&batch().obs);
+    let mut tape = OwnedTape::default();
+    let mut scale = RunningScale::default();
+    let loss = networks.policy_loss(&mut tape, &z, 2, 1e-4, &mut scale, &mut rng::stream(0, "alone"));
+    let mut gradients = ops::total(tape, &[(1.0, loss.climb), (1.0, loss.entropy)]).backward();
+    for (name, parameter) in networks.model.parameters() {
+        assert!(gradients.get_or_alloc_mut(parameter).expect("memory").iter().all(|g| *g == 0.0), "{name}");
+    }
+}

@@ -1,0 +1,91 @@
+use super::*;
+use crate::env::{Env, Task};
+use crate::nn::{Parameters, ops, tensor, values, values_mut};
+use crate::rng;
+
+/// Planning's fast path gives the returns of the model itself, for counts that fill no panel.
+#[test]
+fn frozen_returns_are_those_of_the_model() {
+    let mut env = Task::Cartpole.make();
+    let config =
+        ImplicitConfig { latent: 24, group: 4, units: 33, critics: 3, terminates: true, ..ImplicitConfig::default() };
+    let mut rng = rng::stream(0, "frozen model");
+    let mut model = ImplicitModel::new(env.spec(), &config, &mut rng);
+    let mut policy = PolicyPrior::new(model.device(), 24, 33, 1, &mut rng);
+    let parameters = model.parameters_mut().into_iter().chain(policy.parameters_mut());
+    for (_, parameter) in parameters {
+        let moved: Vec<f32> = values(parameter).iter().map(|w| w + 0.2 * rng::normal(&mut rng) as f32).collect();
+        parameter.copy_from(&moved);
+    }
+    let (count, horizon, discount, pair) = (45, 4, 0.9, [2, 0]);
+    let z = model.encode(&env.reset(0));
+    let sequences: Vec<f32> = normals(count * horizon, &mut rng).iter().map(|a| a.tanh()).collect();
+    let noise = normals(count, &mut rng);
+    let column = |t: usize| {
+        let actions = sequences.iter().skip(t).step_by(horizon).copied().collect();
+        tensor(&device(), actions, (1, count, 1))
+    };
+    let start = tensor(model.device(), values(&z).repeat(count), (1, count, 24));
+    // Moves the head so that half of the rollouts end with the first step.
+    let ends = |model: &ImplicitModel, z: &Tensor3| {
+        values(&model.termination.as_ref().expect("a head").forward(z.clone(), Grad::Input)).to_vec()
+    };
+    let mut logits = ends(&model, &model.next(&mut NoneTape, &start, &column(0)));
+    logits.sort_by(f32::total_cmp);
+    let mut heads = model.termination.parameters_mut();
+    values_mut(heads.last_mut().expect("the last bias").1)[0] -= logits[count / 2];
+    let frozen = FrozenModel::new(&model, &policy);
+    let found = frozen.returns(values(&z), &sequences, horizon, &noise, pair, discount);
+    assert_eq!(found.len(), count);
+
+    let mut state = start.clone();
+    let (mut expected, mut alive) = (vec![0.0; count], vec![1.0; count]);
+    for t in 0..=horizon {
+        let (actions, values_of) = if t < horizon {
+            (column(t), model.rewards(&state, &column(t)))
+        } else {
+            let actions = policy.sample_on(&mut NoneTape, &state, &noise).0;
+            let critics = model.critics().some(model.device(), &pair);
+            let q = model.values(&critics, &state, &actions);
+            (actions, (0..count).map(|i| 0.5 * (q[i] + q[count + i])).collect())
+        };
+        for i in 0..count {
+            expected[i] += alive[i] * discount.powi(t as i32) * values_of[i];
+        }
+        if t < horizon {
+            state = model.next(&mut NoneTape, &state, &actions);
+            let ends = ends(&model, &state);
+            (0..count).filter(|i| ends[*i] > 0.0).for_each(|i| alive[i] = 0.0);
+        }
+    }
+    assert!(alive.contains(&0.0) && alive.contains(&1.0), "some end and some do not");
+    for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
+        assert!((found - expected).abs() < 1e-3 * expected.abs().max(1.0), "{i}: {found}, expected {expected}");
+    }
+
+    // The policy's first actions, too.
+    let noise = normals(count * horizon, &mut rng);
+    let proposed = frozen.policy_sequences(values(&z), horizon, &noise);
+    let first: Vec<f32> = noise.iter().step_by(horizon).copied().collect();
+    let expected = policy.sample_on(&mut NoneTape, &start, &first).0;
+    for (found, expected) in proposed.iter().step_by(horizon).zip(values(&expected)) {
+        assert!((found - expected).abs() < 1e-4, "{found}, expected {expected}");
+    }
+}
+
+/// No gradient reaches the encoder's targets, and a model that does not change predicts no change.
+#[test]
+fn drift_is_one_for_a_model_that_predicts_no_change() {
+    let cpu = device();
+    let (first, truth) = (tensor(&cpu, vec![0.5, 0.5], (1, 1, 2)), tensor(&cpu, vec![0.2, 0.8, 0.1, 0.9], (1, 2, 2)));
+    let none = ops::scale_rows(first.clone(), &[0.0]);
+    let loss = |latents: Vec<Tensor3>| ImplicitLoss {
+        consistency: none.clone(),
+        reward: none.clone(),
+        value: none.clone(),
+        termination: None,
+        latents,
+    };
+    assert_eq!(loss(vec![first.clone(), first.clone(), first.clone()]).drift(&truth), 1.0);
+    assert_eq!(loss(vec![first.clone(), first, tensor(&cpu, vec![0.1, 0.9], (1, 1, 2))]).drift(&truth), 0.0);
+}
