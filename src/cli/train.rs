@@ -13,7 +13,7 @@ use crate::study::starts::Starts;
 
 #[derive(clap::Args)]
 pub(super) struct Args {
-    /// The task: reach, push, lift, stack, pendulum, cartpole, or one that was registered
+    /// The task: reach, push, lift, stack, door, pendulum, cartpole, or one that was registered
     #[arg(long)]
     task: String,
     /// The method: a preset, like sac

@@ -256,7 +256,8 @@ fn handle() -> Hinge {
         point: Vector3::zeros(),
         axis: Vector3::y(),
         range: [-1.57, 1.57],
-        // The drag of the air: MuJoCo takes the handle for a plank as long as its inertia says, two metres.
+        // robosuite sets none, but there the released handle comes back as slowly as this. (Perhaps the drag of the air: MuJoCo takes
+        // a body for a box of its inertia, here one of two metres.)
         damping: 0.2,
         friction: 0.1,
         stiffness: 1.0,
