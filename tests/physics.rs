@@ -232,7 +232,8 @@ struct DoorEpisode {
 }
 
 /// Actions that press the handle down and pull the door open by the friction of a finger, in robosuite and here. Until the
-/// handle is turned, positions decide; from then on the finger slides as well. (Beyond 0.2 rad it slips off here and not there.)
+/// handle is turned, positions decide; from then on the finger slides as well. (Beyond 0.2 rad it slips off here
+/// and not there; the reference leaves out those steps, so it ends before the door counts as open.)
 #[test]
 fn the_door_opens_as_in_robosuite() {
     let text = include_str!("../data/reference/door.toml");
