@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::output::answer;
 use crate::error::Result;
-use crate::study::evaluate::{EvalSeeds, Evaluator};
+use crate::study::evaluate::{EvalSeeds, Evaluation, Evaluator};
 use crate::study::registry::Registry;
 use crate::study::starts::Starts;
 
@@ -31,7 +31,12 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let (config, mut method) = registry.trained_method(&args.run)?;
     let seeds = args.seed.map_or(args.starts.unwrap_or(config.starts).test(), EvalSeeds::Seed);
     let mut evaluator = Evaluator::new(|| registry.make_env(&config))?;
-    let summary = evaluator.evaluate(&mut method, args.episodes, seeds)?.summary();
+    let mut evaluation = Evaluation::default();
+    while !evaluator.next_batch(&mut evaluation, &mut method, args.episodes, seeds)? {
+        // Only the results are asked for, and a million episodes do not fit into memory.
+        evaluation.episodes.clear();
+    }
+    let summary = evaluation.summary();
     answer(if args.json {
         serde_json::to_string_pretty(&summary).expect("a summary is JSON")
     } else {
