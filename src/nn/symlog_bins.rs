@@ -48,6 +48,11 @@ impl SymlogBins {
         2.0 * self.limit / (self.count - 1) as f32
     }
 
+    /// Whether `x` lies within the outermost bins, so that it can be represented.
+    pub fn hold(&self, x: f32) -> bool {
+        symlog(x).abs() <= self.limit
+    }
+
     /// The two-hot code of `x`: a bin's index, and the weights of that bin and the next one. Numbers beyond the outermost
     /// bins get all their weight there; the weights of NaN are NaN.
     pub fn encode(&self, x: f32) -> (usize, [f32; 2]) {
@@ -173,6 +178,7 @@ mod tests {
                 assert!((decoded - back).abs() < 2e-5 * back.abs().max(1.0), "{x}: {decoded}, expected {back}");
             }
         }
+        assert!(bins.hold(-22_000.0) && !bins.hold(22_100.0));
         assert!(bins.encode(f32::NAN).1[0].is_nan());
         let logits = (0..101).map(|k| -((k - 55) as f32).powi(2) / 8.0).collect();
         let logits = tensor(&device(), logits, (1, 1, 101));

@@ -13,9 +13,10 @@ use crate::rng::Rng;
 
 impl TdMpc2 {
     /// One update on freshly drawn slices of `horizon` steps; `None` while no episode is that long. Returns the means of
-    /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `target`, the mean value target; `q`, the mean value
-    /// of the policy's actions; `latent_drift` ([`drift`](crate::model::ImplicitLoss::drift)); `value_scale`; and the norms of
-    /// the gradients before clipping.
+    /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `target`, the mean value target, and
+    /// `targets_beyond_bins`, the share of targets that no bin holds (more than a few: raise `bin_limit`); `q`, the mean value of
+    /// the policy's actions; `latent_drift` ([`drift`](crate::model::ImplicitLoss::drift)); `value_scale`; and the norms of the
+    /// gradients before clipping.
     pub fn learn(&mut self) -> Option<Losses> {
         let Self { config, networks, scale, discount, replay, rng, .. } = self;
         let batch = replay.sample_within_episodes(config.batch, config.horizon + 1, rng)?;
@@ -31,6 +32,8 @@ impl TdMpc2 {
         losses.insert("value_loss", ops::mean(&loss.value));
         losses.insert("latent_drift", loss.drift(&encoded));
         losses.insert("target", targets.iter().sum::<f32>() / targets.len() as f32);
+        let beyond = targets.iter().filter(|target| !networks.model.bins().hold(**target)).count();
+        losses.insert("targets_beyond_bins", beyond as f32 / targets.len() as f32);
         let mut gradients = ops::total(tape, &weighted).backward();
         losses.insert("model_gradient", self.model_optimiser.step(&mut networks.model, &mut gradients));
 

@@ -21,7 +21,8 @@ pub struct ImplicitConfig {
     pub critics: usize,
     /// Bins of the two-hot distributions of rewards and values, an odd number.
     pub bins: usize,
-    /// The outermost bins, in symlog space: 5 reaches to 147.
+    /// The outermost bins, in symlog space. They have to hold every value, up to reward / (1 - discount): 5 reaches to 147, 10 to
+    /// 22,025. Beyond them all values are the same, and nothing leads out of there.
     pub bin_limit: f32,
     /// Whether to learn when the task itself ends. Without it a plan never ends; with a time limit alone that is right.
     pub terminates: bool,
@@ -44,8 +45,8 @@ impl Default for ImplicitConfig {
             encoder: 128,
             units: 128,
             critics: 2,
-            bins: 51,
-            bin_limit: 5.0,
+            bins: 101,
+            bin_limit: 10.0,
             terminates: false,
             decay: 0.5,
             consistency: 20.0,

@@ -7,8 +7,16 @@ use crate::rng;
 #[test]
 fn frozen_returns_are_those_of_the_model() {
     let mut env = Task::Cartpole.make();
-    let config =
-        ImplicitConfig { latent: 24, group: 4, units: 33, critics: 3, terminates: true, ..ImplicitConfig::default() };
+    let config = ImplicitConfig {
+        latent: 24,
+        group: 4,
+        units: 33,
+        critics: 3,
+        bins: 51,
+        bin_limit: 5.0,
+        terminates: true,
+        ..ImplicitConfig::default()
+    };
     let mut rng = rng::stream(0, "frozen model");
     let mut model = ImplicitModel::new(env.spec(), &config, &mut rng);
     let mut policy = PolicyPrior::new(model.device(), 24, 33, 1, &mut rng);
