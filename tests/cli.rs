@@ -47,6 +47,12 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--jobs", "0"], &["--jobs"]);
     refused(here, &["study", "--tasks", "pendulum", "--methods", "scripted"], &["pendulum has no scripted policy"]);
     let beyond = ["it must lie in 0..1048576"];
+    check(train(&["--steps", "-5"]), &["'-5'", "--steps", "a whole number"]);
+    check(train(&["--steps", "1e3"]), &["'1e3'", "--steps", "a whole number"]);
+    check(train(&["--seed", "-1"]), &["'-1'", "--seed", "a whole number"]);
+    check(train(&["--seed", "99999999999999999999"]), &["--seed", "too large"]);
+    refused(here, &["study", "--seeds", "-1"], &["'-1'", "--seeds", "a number of seeds"]);
+    refused(here, &["evaluate", "--run", "run", "--episodes", "-1"], &["'-1'", "--episodes", "a whole number"]);
     check(train(&["--seed", "2097152"]), &["`seed` is 2097152", beyond[0]]);
     check(train(&["--seed", "18446744073709551615"]), &["`seed` is 18446744073709551615", beyond[0]]);
     check(train(&["--steps", "9223372036854775808"]), &["`steps` is 9223372036854775808", "it must lie in 0.."]);
@@ -180,7 +186,6 @@ fn train_evaluate_and_watch() {
     refused(here, &["evaluate", "--run", "run"], &["weights.safetensors", "damaged"]);
 }
 
-#[cfg(unix)]
 /// The program ends as if all had been read, or says in one line what could not be written.
 #[cfg(unix)]
 #[test]
@@ -198,6 +203,13 @@ fn nobody_has_to_listen() {
         assert!(output.status.success() && said.is_empty(), "{rest}: {said}");
         assert!(here.join(run).join("summary.toml").exists(), "{rest}: the run is complete");
     }
+    let output = shell("handful watch --task pendulum --policy random --out /dev/stdout | head -c 9");
+    let said = text(&output.stdout);
+    assert!(said.to_lowercase().starts_with("<!doctype"), "{said}: {}", text(&output.stderr));
+    let output = shell("HANDFUL_SHAKE=-1 handful evaluate --run pipe --episodes 1");
+    let said = text(&output.stderr);
+    assert!(output.status.code() == Some(2) && said.lines().count() == 1, "{said}");
+    assert!(said.contains("HANDFUL_SHAKE is \"-1\"; it must be a whole number"), "{said}");
     let output = shell("handful evaluate --run pipe --episodes 1 >/dev/full");
     let said = text(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{said}");
@@ -233,6 +245,7 @@ fn signals_end_an_evaluation() {
     }
 }
 
+#[cfg(unix)]
 #[test]
 fn signals_leave_a_run_that_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -269,4 +282,31 @@ fn signals_leave_a_run_that_resumes() {
     child.kill().expect("it still runs");
     let said = text(&child.wait_with_output().expect("the program ends").stderr);
     assert!(said.contains(&format!("going on after {} steps", 100 * done)), "{said}");
+}
+
+/// `nohup handful train ... &` outlives its terminal.
+#[cfg(unix)]
+#[test]
+fn an_ignored_hang_up_stays_ignored() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = env!("CARGO_BIN_EXE_handful");
+    let train = "train --task reach --method debug --steps 200000 --out run";
+    let mut child = Command::new("sh")
+        .current_dir(folder.path())
+        .args(["-c", &format!("trap '' HUP; exec {program} {train}")])
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("a shell");
+    let send = |signal: &str| {
+        let kill = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
+        assert!(kill.success(), "it has ended before {signal}");
+        std::thread::sleep(Duration::from_secs(2));
+    };
+    std::thread::sleep(Duration::from_secs(2));
+    send("-HUP");
+    send("-TERM");
+    assert_eq!(child.wait().expect("the program ends").code(), Some(130));
+    let mut said = String::new();
+    std::io::Read::read_to_string(&mut child.stderr.take().expect("a pipe"), &mut said).expect("text");
+    assert_eq!(said.matches("finishing the episodes").count(), 1, "{said}");
 }

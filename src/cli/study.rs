@@ -24,7 +24,7 @@ pub(super) struct Args {
     #[arg(long, value_delimiter = ',')]
     methods: Option<Vec<String>>,
     /// How many seeds, or a range like 0..5
-    #[arg(long, value_parser = seed_range)]
+    #[arg(long, value_parser = seed_range, allow_negative_numbers = true)]
     seeds: Option<Range<u64>>,
     /// Where the runs are measured: test, or development for runs that help to choose settings
     #[arg(long)]

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::output::answer;
 use super::progress::Progress;
-use super::stop_on_ctrl_c;
+use super::{stop_on_ctrl_c, whole};
 use crate::error::Result;
 use crate::study::registry::Registry;
 use crate::study::run::{is_complete, read_summary};
@@ -20,10 +20,10 @@ pub(super) struct Args {
     #[arg(long)]
     method: String,
     /// Environment steps; the preset's number if left out
-    #[arg(long)]
+    #[arg(long, value_parser = whole::<usize>, allow_negative_numbers = true)]
     steps: Option<usize>,
     /// The seed of everything random
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
     /// Where the run is measured: test, or development for a run that helps to choose settings
     #[arg(long)]
