@@ -123,6 +123,15 @@ fn a_small_study_from_start_to_report() {
     let mixed = handful::study::tables::Tables::gather(folders.iter().map(std::path::PathBuf::as_path));
     assert!(mixed.expect_err("two kinds of runs").to_string().contains("compare them separately"));
 
+    // A run and a study have tables of the same names, so neither is written over the other.
+    let table = |folder: &str| std::fs::read_to_string(here.join(folder).join("evaluations.csv")).expect("a table");
+    let (of_study, of_run) = (table("study"), table("study/reach/debug/seed0"));
+    let train = ["train", "--task", "reach", "--method", "debug", "--steps", "200", "--out", "study"];
+    refused(here, &train, &["study", "holds a study", "another --out"]);
+    let study = ["study", "--tasks", "reach", "--methods", "random", "--out", "study/reach/debug/seed0"];
+    refused(here, &study, &["study/reach/debug/seed0", "holds a run", "another --out"]);
+    assert_eq!((of_study, of_run), (table("study"), table("study/reach/debug/seed0")));
+
     // The report is made from the tables alone.
     std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
     let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);

@@ -10,6 +10,7 @@ mod study;
 mod train;
 mod watch;
 
+use std::path::Path;
 use std::process::ExitCode;
 use std::str::FromStr;
 use std::sync::Arc;
@@ -82,6 +83,17 @@ pub fn main(registry: &Registry) -> ExitCode {
 fn whole<T: FromStr>(text: &str) -> Result<T, &'static str> {
     let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     text.parse().map_err(|_| if digits { "it is too large" } else { "give a whole number from 0 on" })
+}
+
+/// Runs and studies have tables of the same names: neither writes over those of the other.
+///
+/// # Errors
+/// If the folder holds a `what`, which this file of it tells.
+fn refuse_folder_of(what: &str, file: &str, folder: &Path) -> Result<()> {
+    if folder.join(file).exists() {
+        return Err(Error::Config(format!("{}: this folder holds a {what}; choose another --out", folder.display())));
+    }
+    Ok(())
 }
 
 /// For commands that have nothing to save: Ctrl-C, SIGTERM and SIGHUP end the program.
