@@ -225,6 +225,21 @@ fn nobody_has_to_listen() {
     assert!(said.contains("cannot write to standard output") && said.lines().count() == 1, "{said}");
 }
 
+/// Hears SIGHUP, also if the tests run under `nohup`, which has it ignored.
+#[cfg(unix)]
+fn program_with_a_terminal() -> Command {
+    use std::os::unix::process::CommandExt;
+    let mut program = Command::new(env!("CARGO_BIN_EXE_handful"));
+    // SAFETY: `signal` may be called between fork and exec.
+    unsafe {
+        program.pre_exec(|| {
+            libc::signal(libc::SIGHUP, libc::SIG_DFL);
+            Ok(())
+        })
+    };
+    program
+}
+
 /// There is nothing to save.
 #[cfg(unix)]
 #[test]
@@ -234,7 +249,7 @@ fn signals_end_an_evaluation() {
     let output = handful(here, &["train", "--task", "pendulum", "--method", "debug", "--out", "run"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     for signal in ["-INT", "-TERM", "-HUP"] {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_handful"))
+        let mut child = program_with_a_terminal()
             .current_dir(here)
             .args(["evaluate", "--run", "run", "--episodes", "1000000"])
             .spawn()
@@ -261,7 +276,7 @@ fn signals_leave_a_run_that_resumes() {
     let here = folder.path();
     let train = ["train", "--task", "reach", "--method", "debug", "--steps", "200000", "--out", "run"];
     let start = || {
-        Command::new(env!("CARGO_BIN_EXE_handful"))
+        program_with_a_terminal()
             .current_dir(here)
             .args(train)
             .stderr(Stdio::piped())
