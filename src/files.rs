@@ -21,11 +21,11 @@ use crate::error::{Error, Result};
 /// # Errors
 /// If the folder cannot be created, or the file cannot be written.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    let path = &target(path)?;
-    // A pipe or a device cannot be replaced by a file.
+    // A pipe or a device cannot be replaced by a file. (Links to those of a process, as /dev/stdout is one, name no file.)
     if path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
         return std::fs::write(path, bytes).map_err(Error::io("write", path));
     }
+    let path = &target(path)?;
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let mut file = temporary().tempfile_in(folder).map_err(Error::io("write in", folder))?;

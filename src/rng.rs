@@ -25,6 +25,8 @@ use std::sync::OnceLock;
 
 use rand::{RngExt, SeedableRng};
 
+use crate::error::{Error, Result};
+
 /// The generator used throughout: xoshiro256++, whose state is four words and can be saved.
 #[doc(alias = "seed")]
 pub type Rng = rand_xoshiro::Xoshiro256PlusPlus;
@@ -36,16 +38,22 @@ pub const SHAKE: &str = "HANDFUL_SHAKE";
 /// The value of [`SHAKE`], read once.
 ///
 /// # Panics
-/// If it is not a whole number below 2^16.
+/// If it is not a whole number below 2^16; [`read_shake`] answers with an error.
 pub fn shake() -> u64 {
     static VALUE: OnceLock<u64> = OnceLock::new();
-    *VALUE.get_or_init(|| match std::env::var(SHAKE) {
-        Err(std::env::VarError::NotPresent) => 0,
-        value => {
-            let number = value.as_ref().ok().and_then(|value| value.parse::<u16>().ok());
-            u64::from(number.unwrap_or_else(|| panic!("{SHAKE} must be a whole number from 0 to 65535, not {value:?}")))
-        }
-    })
+    *VALUE.get_or_init(|| read_shake().unwrap_or_else(|problem| panic!("{problem}")))
+}
+
+/// The value of [`SHAKE`] in the environment.
+///
+/// # Errors
+/// If it is not a whole number below 2^16.
+pub fn read_shake() -> Result<u64> {
+    let Some(value) = std::env::var_os(SHAKE) else { return Ok(0) };
+    let number = value.to_str().and_then(|value| value.parse::<u16>().ok());
+    let problem =
+        || Error::Config(format!("{SHAKE} is {value:?}; it must be a whole number from 0 to 65535, or unset"));
+    number.map(u64::from).ok_or_else(problem)
 }
 
 /// The generator for `purpose` in a run with this `seed`. Different purposes give independent streams. Old checkpoints and

@@ -47,6 +47,12 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--jobs", "0"], &["--jobs"]);
     refused(here, &["study", "--tasks", "pendulum", "--methods", "scripted"], &["pendulum has no scripted policy"]);
     let beyond = ["it must lie in 0..1048576"];
+    check(train(&["--steps", "-5"]), &["'-5'", "--steps", "a whole number"]);
+    check(train(&["--steps", "1e3"]), &["'1e3'", "--steps", "a whole number"]);
+    check(train(&["--seed", "-1"]), &["'-1'", "--seed", "a whole number"]);
+    check(train(&["--seed", "99999999999999999999"]), &["--seed", "too large"]);
+    refused(here, &["study", "--seeds", "-1"], &["'-1'", "--seeds", "a number of seeds"]);
+    refused(here, &["evaluate", "--run", "run", "--episodes", "-1"], &["'-1'", "--episodes", "a whole number"]);
     check(train(&["--seed", "2097152"]), &["`seed` is 2097152", beyond[0]]);
     check(train(&["--seed", "18446744073709551615"]), &["`seed` is 18446744073709551615", beyond[0]]);
     check(train(&["--steps", "9223372036854775808"]), &["`steps` is 9223372036854775808", "it must lie in 0.."]);
@@ -117,6 +123,15 @@ fn a_small_study_from_start_to_report() {
     let mixed = handful::study::tables::Tables::gather(folders.iter().map(std::path::PathBuf::as_path));
     assert!(mixed.expect_err("two kinds of runs").to_string().contains("compare them separately"));
 
+    // A run and a study have tables of the same names, so neither is written over the other.
+    let table = |folder: &str| std::fs::read_to_string(here.join(folder).join("evaluations.csv")).expect("a table");
+    let (of_study, of_run) = (table("study"), table("study/reach/debug/seed0"));
+    let train = ["train", "--task", "reach", "--method", "debug", "--steps", "200", "--out", "study"];
+    refused(here, &train, &["study", "holds a study", "another --out"]);
+    let study = ["study", "--tasks", "reach", "--methods", "random", "--out", "study/reach/debug/seed0"];
+    refused(here, &study, &["study/reach/debug/seed0", "holds a run", "another --out"]);
+    assert_eq!((of_study, of_run), (table("study"), table("study/reach/debug/seed0")));
+
     // The report is made from the tables alone.
     std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
     let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);
@@ -180,7 +195,6 @@ fn train_evaluate_and_watch() {
     refused(here, &["evaluate", "--run", "run"], &["weights.safetensors", "damaged"]);
 }
 
-#[cfg(unix)]
 /// The program ends as if all had been read, or says in one line what could not be written.
 #[cfg(unix)]
 #[test]
@@ -198,10 +212,32 @@ fn nobody_has_to_listen() {
         assert!(output.status.success() && said.is_empty(), "{rest}: {said}");
         assert!(here.join(run).join("summary.toml").exists(), "{rest}: the run is complete");
     }
+    let output = shell("handful watch --task pendulum --policy random --out /dev/stdout | head -c 9");
+    let said = text(&output.stdout);
+    assert!(said.to_lowercase().starts_with("<!doctype"), "{said}: {}", text(&output.stderr));
+    let output = shell("HANDFUL_SHAKE=-1 handful evaluate --run pipe --episodes 1");
+    let said = text(&output.stderr);
+    assert!(output.status.code() == Some(2) && said.lines().count() == 1, "{said}");
+    assert!(said.contains("HANDFUL_SHAKE is \"-1\"; it must be a whole number"), "{said}");
     let output = shell("handful evaluate --run pipe --episodes 1 >/dev/full");
     let said = text(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{said}");
     assert!(said.contains("cannot write to standard output") && said.lines().count() == 1, "{said}");
+}
+
+/// Hears SIGHUP, also if the tests run under `nohup`, which has it ignored.
+#[cfg(unix)]
+fn program_with_a_terminal() -> Command {
+    use std::os::unix::process::CommandExt;
+    let mut program = Command::new(env!("CARGO_BIN_EXE_handful"));
+    // SAFETY: `signal` may be called between fork and exec.
+    unsafe {
+        program.pre_exec(|| {
+            libc::signal(libc::SIGHUP, libc::SIG_DFL);
+            Ok(())
+        })
+    };
+    program
 }
 
 /// There is nothing to save.
@@ -213,7 +249,7 @@ fn signals_end_an_evaluation() {
     let output = handful(here, &["train", "--task", "pendulum", "--method", "debug", "--out", "run"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     for signal in ["-INT", "-TERM", "-HUP"] {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_handful"))
+        let mut child = program_with_a_terminal()
             .current_dir(here)
             .args(["evaluate", "--run", "run", "--episodes", "1000000"])
             .spawn()
@@ -233,13 +269,14 @@ fn signals_end_an_evaluation() {
     }
 }
 
+#[cfg(unix)]
 #[test]
 fn signals_leave_a_run_that_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let here = folder.path();
     let train = ["train", "--task", "reach", "--method", "debug", "--steps", "200000", "--out", "run"];
     let start = || {
-        Command::new(env!("CARGO_BIN_EXE_handful"))
+        program_with_a_terminal()
             .current_dir(here)
             .args(train)
             .stderr(Stdio::piped())
@@ -269,4 +306,31 @@ fn signals_leave_a_run_that_resumes() {
     child.kill().expect("it still runs");
     let said = text(&child.wait_with_output().expect("the program ends").stderr);
     assert!(said.contains(&format!("going on after {} steps", 100 * done)), "{said}");
+}
+
+/// `nohup handful train ... &` outlives its terminal.
+#[cfg(unix)]
+#[test]
+fn an_ignored_hang_up_stays_ignored() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = env!("CARGO_BIN_EXE_handful");
+    let train = "train --task reach --method debug --steps 200000 --out run";
+    let mut child = Command::new("sh")
+        .current_dir(folder.path())
+        .args(["-c", &format!("trap '' HUP; exec {program} {train}")])
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("a shell");
+    let send = |signal: &str| {
+        let kill = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
+        assert!(kill.success(), "it has ended before {signal}");
+        std::thread::sleep(Duration::from_secs(2));
+    };
+    std::thread::sleep(Duration::from_secs(2));
+    send("-HUP");
+    send("-TERM");
+    assert_eq!(child.wait().expect("the program ends").code(), Some(130));
+    let mut said = String::new();
+    std::io::Read::read_to_string(&mut child.stderr.take().expect("a pipe"), &mut said).expect("text");
+    assert_eq!(said.matches("finishing the episodes").count(), 1, "{said}");
 }

@@ -4,8 +4,8 @@ use handful::env::{Env, Feature, KnownReward, Spec, Task};
 use handful::model::calibration::{GaussianForecast, coverage};
 use handful::model::open_loop::{OpenLoop, Propagated, open_loop};
 use handful::model::{
-    Autoencoder, AutoencoderConfig, Differentiable, Ensemble, EnsembleConfig, Imagination, Propagation, Reward,
-    RssmConfig, WorldModel, WorldModelConfig,
+    Autoencoder, AutoencoderConfig, Differentiable, Ensemble, EnsembleConfig, Imagination, ImplicitConfig,
+    ImplicitModel, Propagation, Reward, RssmConfig, WorldModel, WorldModelConfig,
 };
 use handful::nn::{Adam, AdamConfig, tensor, values};
 use handful::replay::{Episode, ReplayBuffer, SequenceReplay, Transition};
@@ -524,5 +524,19 @@ fn a_learned_reward_sees_the_goal() {
     for (x, goal) in [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.8, 0.7)] {
         let (predicted, truth) = (reward(x, goal), -f64::from((goal - x).abs()));
         assert!((predicted - truth).abs() < 0.15, "at {x}, goal {goal}: {predicted}, not {truth}");
+    }
+}
+
+#[test]
+fn latent_models_refuse_settings_out_of_range() {
+    let config = ImplicitConfig { latent: 0, ..ImplicitConfig::default() };
+    let problem = ImplicitModel::try_new(&spec(), &config, &mut rng::stream(0, "ranges")).expect_err("no latent state");
+    assert!(problem.to_string().starts_with("`model.latent` is 0; it must lie in"), "{problem}");
+    for (config, expected) in [
+        (WorldModelConfig { units: 0, ..WorldModelConfig::default() }, "`world.units` is 0; it must lie in 1..=4096"),
+        (WorldModelConfig { bins: 40, ..WorldModelConfig::default() }, "`world`: `bins` must be odd"),
+    ] {
+        let problem = WorldModel::try_new(&spec(), &config, &mut rng::stream(0, "ranges")).expect_err(expected);
+        assert_eq!(problem.to_string(), expected);
     }
 }

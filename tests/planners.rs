@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use handful::model::EnsembleConfig;
 use handful::plan::{
-    ActionSequences, CemConfig, ControlConfig, GradientConfig, GuidedConfig, HybridConfig, IcemConfig, Iteration,
+    ActionSequences, Cem, CemConfig, ControlConfig, GradientConfig, GuidedConfig, HybridConfig, IcemConfig, Iteration,
     MakePlanner, MppiConfig, Objective, Plan, PlanObserver, Planner, PlannerConfig, RecedingHorizon, ShootingConfig,
 };
 use handful::prelude::*;
@@ -299,6 +299,60 @@ fn a_planner_of_ones_own_enters_receding_horizon_control() {
         assert_eq!(control.act(&mut left, &mut |_| {}, &mut rng::stream(0, "own planner")), [-1.0]);
     }
     assert_eq!(plans, 2);
+}
+
+/// As agents do that read their settings from a file.
+#[test]
+fn settings_out_of_range_are_refused() {
+    let icem = IcemConfig { horizon: 1, ..IcemConfig::default() };
+    let hybrid = HybridConfig { icem: icem.clone(), ..HybridConfig::default() };
+    let most = ShootingConfig { horizon: 1000, population: 1_000_000 };
+    for (config, action_size, expected) in [
+        (
+            PlannerConfig::Shooting(ShootingConfig { horizon: 2, population: 0 }),
+            1,
+            "`planner.shooting.population` is 0",
+        ),
+        (
+            PlannerConfig::Cem(CemConfig { momentum: f64::NAN, ..CemConfig::default() }),
+            1,
+            "`planner.cem.momentum` is NaN; it must lie in 0.0..=1.0",
+        ),
+        (
+            PlannerConfig::Cem(CemConfig { elites: 500, ..CemConfig::default() }),
+            1,
+            "`planner.cem`: `elites` must not exceed `population`",
+        ),
+        (PlannerConfig::Icem(icem), 1, "`planner.icem.horizon` is 1"),
+        (
+            PlannerConfig::Mppi(MppiConfig { temperature: 0.0, ..MppiConfig::default() }),
+            1,
+            "`planner.mppi.temperature` is 0.0",
+        ),
+        (
+            PlannerConfig::Guided(GuidedConfig { iterations: 0, ..GuidedConfig::default() }),
+            1,
+            "`planner.guided.iterations` is 0",
+        ),
+        (
+            PlannerConfig::Gradient(GradientConfig { rate: -1.0, ..GradientConfig::default() }),
+            1,
+            "`planner.gradient.rate` is -1.0",
+        ),
+        (PlannerConfig::Hybrid(hybrid), 1, "`planner.hybrid.icem.horizon` is 1"),
+        (PlannerConfig::Shooting(most), 1, "do not fit into memory"),
+        (PlannerConfig::Cem(CemConfig::default()), 0, "`action_size` is 0"),
+    ] {
+        let problem = config.try_build(action_size).err().expect(expected).to_string();
+        assert!(problem.contains(expected), "{problem}");
+    }
+    assert!(PlannerConfig::Cem(CemConfig::default()).try_build(2).is_ok());
+}
+
+#[test]
+#[should_panic(expected = "`cem.momentum` is NaN; it must lie in 0.0..=1.0")]
+fn a_planner_without_answer_to_its_settings_says_which() {
+    Cem::new(CemConfig { momentum: f64::NAN, ..CemConfig::default() }, 1);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::output::answer;
+use super::whole;
 use crate::error::Result;
 use crate::study::evaluate::{EvalSeeds, Evaluation, Evaluator};
 use crate::study::registry::Registry;
@@ -14,10 +15,10 @@ pub(super) struct Args {
     #[arg(long)]
     run: PathBuf,
     /// Episodes
-    #[arg(long, default_value_t = 100)]
+    #[arg(long, default_value_t = 100, value_parser = whole::<usize>, allow_negative_numbers = true)]
     episodes: usize,
     /// The seed of the initial states
-    #[arg(long, conflicts_with = "starts")]
+    #[arg(long, conflicts_with = "starts", value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: Option<u64>,
     /// The initial states: test, or development (on which settings are chosen) [default: those of the run's test]
     #[arg(long)]

@@ -10,7 +10,9 @@ mod study;
 mod train;
 mod watch;
 
+use std::path::Path;
 use std::process::ExitCode;
+use std::str::FromStr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -19,6 +21,7 @@ use console::style;
 
 use self::output::note;
 use crate::error::{Error, Result};
+use crate::rng::read_shake;
 use crate::study::registry::Registry;
 
 /// Model-based reinforcement learning on a robot arm. Without a command: the quick study.
@@ -55,14 +58,14 @@ pub fn main(registry: &Registry) -> ExitCode {
         }
         Err(problem) => problem.exit(),
     };
-    let outcome = match cli.command {
+    let outcome = read_shake().and_then(|_| match cli.command {
         None => study::run(registry, study::Args::default()),
         Some(Command::Study(args)) => study::run(registry, args),
         Some(Command::Train(args)) => train::run(registry, args),
         Some(Command::Evaluate(args)) => end_on_ctrl_c().and_then(|()| evaluate::run(registry, &args)),
         Some(Command::Report(args)) => end_on_ctrl_c().and_then(|()| report::run(&args)),
         Some(Command::Watch(args)) => end_on_ctrl_c().and_then(|()| watch::run(registry, &args)),
-    };
+    });
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(Error::Interrupted) => {
@@ -74,6 +77,23 @@ pub fn main(registry: &Registry) -> ExitCode {
             ExitCode::from(2)
         }
     }
+}
+
+/// A number on the command line.
+fn whole<T: FromStr>(text: &str) -> Result<T, &'static str> {
+    let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    text.parse().map_err(|_| if digits { "it is too large" } else { "give a whole number from 0 on" })
+}
+
+/// Runs and studies have tables of the same names: neither writes over those of the other.
+///
+/// # Errors
+/// If the folder holds a `what`, which this file of it tells.
+fn refuse_folder_of(what: &str, file: &str, folder: &Path) -> Result<()> {
+    if folder.join(file).exists() {
+        return Err(Error::Config(format!("{}: this folder holds a {what}; choose another --out", folder.display())));
+    }
+    Ok(())
 }
 
 /// For commands that have nothing to save: Ctrl-C, SIGTERM and SIGHUP end the program.
@@ -96,6 +116,17 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
+/// A SIGHUP that was ignored when the program began stays so: `nohup handful train ... &` outlives its terminal.
 fn handle_ctrl_c(handler: impl FnMut() + Send + 'static) -> Result<()> {
-    ctrlc::set_handler(handler).map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))
+    // SAFETY: to ignore a signal runs no code of ours; the answer is what was done about it before.
+    #[cfg(unix)]
+    let ignore_hang_up = || unsafe { libc::signal(libc::SIGHUP, libc::SIG_IGN) };
+    #[cfg(unix)]
+    let before = ignore_hang_up();
+    ctrlc::set_handler(handler).map_err(|problem| Error::Config(format!("cannot watch for Ctrl-C: {problem}")))?;
+    #[cfg(unix)]
+    if before == libc::SIG_IGN {
+        ignore_hang_up();
+    }
+    Ok(())
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::progress::Progress;
-use super::stop_on_ctrl_c;
+use super::{refuse_folder_of, stop_on_ctrl_c};
 use crate::error::Result;
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
@@ -24,7 +24,7 @@ pub(super) struct Args {
     #[arg(long, value_delimiter = ',')]
     methods: Option<Vec<String>>,
     /// How many seeds, or a range like 0..5
-    #[arg(long, value_parser = seed_range)]
+    #[arg(long, value_parser = seed_range, allow_negative_numbers = true)]
     seeds: Option<Range<u64>>,
     /// Where the runs are measured: test, or development for runs that help to choose settings
     #[arg(long)]
@@ -70,6 +70,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     plan.methods = args.methods.unwrap_or(plan.methods);
     plan.seeds = args.seeds.unwrap_or(plan.seeds);
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
+    refuse_folder_of("run", "config.toml", &plan.folder)?;
     let mut runs = plan.runs(registry)?;
     runs.iter_mut().for_each(|(config, _)| config.starts = args.starts.unwrap_or(config.starts));
     let stop = stop_on_ctrl_c()?;

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::output::answer;
 use super::progress::Progress;
-use super::stop_on_ctrl_c;
+use super::{refuse_folder_of, stop_on_ctrl_c, whole};
 use crate::error::Result;
 use crate::study::registry::Registry;
 use crate::study::run::{is_complete, read_summary};
@@ -20,10 +20,10 @@ pub(super) struct Args {
     #[arg(long)]
     method: String,
     /// Environment steps; the preset's number if left out
-    #[arg(long)]
+    #[arg(long, value_parser = whole::<usize>, allow_negative_numbers = true)]
     steps: Option<usize>,
     /// The seed of everything random
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
     /// Where the run is measured: test, or development for a run that helps to choose settings
     #[arg(long)]
@@ -41,6 +41,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     let mut config = registry.config(&task, &method, seed, steps, config.as_deref())?;
     config.starts = starts.unwrap_or(config.starts);
     let folder = out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{method}-seed{seed}")));
+    refuse_folder_of("study", "tests.csv", &folder)?;
     if is_complete(&folder, &config) {
         answer(format_args!("this run is complete: {}", folder.display()))?;
         return print_test(&folder);

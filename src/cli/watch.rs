@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::output::answer;
+use super::whole;
 use crate::error::{Error, Result};
 use crate::study::registry::Registry;
 use crate::study::starts::EvalSeeds;
@@ -20,7 +21,7 @@ pub(super) struct Args {
     #[arg(long, default_value = "scripted", conflicts_with = "run")]
     policy: String,
     /// The seed of the initial state: the first that `evaluate --seed` meets with it
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
     /// The file [default: NAME.html]
     #[arg(long)]

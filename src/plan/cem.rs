@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::{self, Rng};
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Variance of the search distribution at the start of every plan: (upper - lower)^2 / 16.
 const START_VARIANCE: f64 = 0.25;
@@ -61,7 +61,11 @@ pub struct Cem {
 
 impl Cem {
     /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: CemConfig, action_size: usize) -> Self {
+        must_hold(&config, "cem");
         let mean = vec![0.0; config.horizon * action_size];
         Self { config, action_size, mean }
     }

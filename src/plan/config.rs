@@ -6,7 +6,8 @@ use super::{
     Cem, CemConfig, Gradient, GradientConfig, GuidedConfig, GuidedMppi, Hybrid, HybridConfig, Icem, IcemConfig,
     MakePlanner, Mppi, MppiConfig, Planner, RandomShooting, ShootingConfig,
 };
-use crate::settings::ranges;
+use crate::error::{Error, Result};
+use crate::settings::{Ranges, fits, ranges};
 
 /// A planner of this crate with its settings.
 ///
@@ -38,6 +39,24 @@ pub enum PlannerConfig {
 
 impl PlannerConfig {
     /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Errors
+    /// If a setting lies outside its range, an action has no numbers, or the candidates do not fit into memory.
+    pub fn try_build(&self, action_size: usize) -> Result<Box<dyn Planner>> {
+        self.check_at("planner")?;
+        if action_size == 0 {
+            return Err(Error::Config("`action_size` is 0; a planner needs actions of at least one number".into()));
+        }
+        if !fits(&[self.candidates(), self.horizon(), action_size]) {
+            return Err(Error::Config("`planner`: the candidates times `horizon` do not fit into memory".into()));
+        }
+        Ok(self.build(action_size))
+    }
+
+    /// The same from settings that were checked, as those of an agent are.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn build(&self, action_size: usize) -> Box<dyn Planner> {
         match self {
             PlannerConfig::Shooting(config) => Box::new(RandomShooting::new(config.clone(), action_size)),

@@ -9,7 +9,7 @@ use super::noise::ColoredNoise;
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted};
 use crate::nn::adam_step;
 use crate::rng::Rng;
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`Gradient`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -63,8 +63,9 @@ impl Gradient {
     /// A planner for actions of `action_size` numbers.
     ///
     /// # Panics
-    /// If the horizon is shorter than 2.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: GradientConfig, action_size: usize) -> Self {
+        must_hold(&config, "gradient");
         let noise = ColoredNoise::new(config.noise_beta, config.horizon);
         Self { before: vec![0.0; config.horizon * action_size], noise, action_size, config }
     }

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted};
 use crate::rng::{self, Rng};
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`GuidedMppi`]. The defaults are TD-MPC2's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -106,7 +106,11 @@ pub struct GuidedMppi {
 
 impl GuidedMppi {
     /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: GuidedConfig, action_size: usize) -> Self {
+        must_hold(&config, "guided");
         let numbers = config.horizon * action_size;
         Self { mean: vec![0.0; numbers], deviation: vec![config.max_deviation; numbers], action_size, config }
     }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::gradient::ascend;
 use super::{ActionSequences, GradientConfig, Icem, IcemConfig, Objective, Plan, PlanObserver, Planner};
 use crate::rng::Rng;
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`Hybrid`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -41,8 +41,9 @@ impl Hybrid {
     /// A planner for actions of `action_size` numbers.
     ///
     /// # Panics
-    /// If the horizon is shorter than 2.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: HybridConfig, action_size: usize) -> Self {
+        must_hold(&config, "hybrid");
         let HybridConfig { icem, iterations, rate } = config;
         let ascent = GradientConfig { horizon: icem.horizon, starts: 1, iterations, rate, ..GradientConfig::default() };
         Self { icem: Icem::new(icem, action_size), ascent, action_size }

@@ -14,7 +14,7 @@ use super::cem::refit;
 use super::noise::ColoredNoise;
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, best, shifted};
 use crate::rng::Rng;
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`Icem`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -95,8 +95,9 @@ impl Icem {
     /// A planner for actions of `action_size` numbers.
     ///
     /// # Panics
-    /// If the horizon is shorter than 2.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: IcemConfig, action_size: usize) -> Self {
+        must_hold(&config, "icem");
         let noise = ColoredNoise::new(config.noise_beta, config.horizon);
         Self { mean: vec![0.0; config.horizon * action_size], elites: Vec::new(), noise, action_size, config }
     }

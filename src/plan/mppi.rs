@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, shifted};
 use crate::rng::{self, Rng};
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`Mppi`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -63,7 +63,11 @@ pub struct Mppi {
 
 impl Mppi {
     /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: MppiConfig, action_size: usize) -> Self {
+        must_hold(&config, "mppi");
         Self { mean: vec![0.0; config.horizon * action_size], before: vec![0.0; action_size], action_size, config }
     }
 

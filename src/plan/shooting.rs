@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best};
 use crate::rng::{self, Rng};
-use crate::settings::ranges;
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`RandomShooting`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -34,7 +34,11 @@ pub struct RandomShooting {
 
 impl RandomShooting {
     /// A planner for actions of `action_size` numbers.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
     pub fn new(config: ShootingConfig, action_size: usize) -> Self {
+        must_hold(&config, "shooting");
         Self { config, action_size }
     }
 }

@@ -104,6 +104,14 @@ impl<N: Number> Rule<Vec<N>> for RangeInclusive<N> {
     }
 }
 
+/// For constructors that do not answer with an error.
+///
+/// # Panics
+/// If a setting lies outside its range.
+pub(crate) fn must_hold(settings: &impl Ranges, path: &str) {
+    settings.check_at(path).unwrap_or_else(|problem| panic!("{problem}"));
+}
+
 /// A path one level further down.
 pub(crate) fn below(path: &str, field: &str) -> String {
     if path.is_empty() { field.into() } else { format!("{path}.{field}") }

@@ -79,15 +79,18 @@ impl RunConfig {
     pub fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
         let table: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
+        let cut =
+            |what: &str| Err(Error::Config(format!("{}: {what}; restore the file, or remove the run", path.display())));
         // Files of earlier versions do not tell how many values they have.
         if let Some(count) = table.get(VALUES) {
             let left = count_values(&table) - 1;
-            if *count != Value::Integer(left) || !text.ends_with('\n') {
-                return Err(Error::Config(format!(
-                    "{}: {left} values are left of {count}; restore the file, or remove the run",
-                    path.display()
-                )));
+            if *count != Value::Integer(left) {
+                return cut(&format!("{left} values are left of {count}"));
             }
+        }
+        // A number that lost its last digits is a number, too.
+        if !text.is_empty() && !text.ends_with('\n') {
+            return cut("its last line has no end");
         }
         let config = Self::from_toml(&text).map_err(|problem| bad_config(path, &problem))?;
         config.check().map_err(|problem| Error::Config(format!("{}: {problem}", path.display())))?;

@@ -1,6 +1,5 @@
 //! The report of a study, written from its tables alone.
 
-use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 use std::time::Duration;
@@ -8,7 +7,7 @@ use std::time::Duration;
 use super::figures;
 use super::starts::Starts;
 use super::tables::{BASELINE, Curve, LEVEL, Tables};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::files;
 
 /// A temporary file that is older than this is nobody's any more.
@@ -24,7 +23,6 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     files::sweep(to, ABANDONED);
     tables.write_summary(to)?;
     let pairs = tables.tasks_and_methods()?;
-    check_figure_names(&pairs)?;
     let mut tasks: Vec<&str> = Vec::new();
     for (task, _) in &pairs {
         if !tasks.contains(&task.as_str()) {
@@ -61,7 +59,8 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         write!(text, "\n![Success rate and smoothness of each method on {task} in the final test]({tests})\n")
             .expect("text grows");
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
-            let file = format!("{task}-{method}-model.svg");
+            let stem = figures::stem(task, method);
+            let file = format!("{stem}-model.svg");
             if figures::model(&tables, task, method, &to.join(&file))? {
                 write!(
                     text,
@@ -69,7 +68,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
                 )
                 .expect("text grows");
             }
-            let file = format!("{task}-{method}-values.svg");
+            let file = format!("{stem}-values.svg");
             if figures::values(&tables, task, method, &to.join(&file))? {
                 write!(text, "\n![Value estimated by {method} on {task} over environment steps, and the return that followed]({file})\n")
                     .expect("text grows");
@@ -86,20 +85,6 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += &caveat(&tables, &pairs)?;
     files::write(&to.join("report.md"), text.as_bytes())?;
     Ok(tuning_note(&tables)?.to_string() + &text_table(&rows(&tables)?))
-}
-
-/// # Errors
-/// If the figures of two pairs of task and method would have the same name, as those of `a-b` by `c` and of `a` by `b-c`.
-fn check_figure_names(pairs: &[(String, String)]) -> Result<()> {
-    let mut names = BTreeMap::new();
-    for (task, method) in pairs {
-        if let Some((other, by)) = names.insert(format!("{task}-{method}"), (task, method)) {
-            return Err(Error::Config(format!(
-                "the figures of `{other}` by `{by}` and of `{task}` by `{method}` would have the same names; rename a method"
-            )));
-        }
-    }
-    Ok(())
 }
 
 /// What stands above the numbers of runs that served to choose settings.

@@ -353,6 +353,10 @@ fn a_run_does_not_read_half_of_its_configuration() {
     let (_, old) = whole.split_once('\n').expect("several lines");
     std::fs::write(&path, old).expect("a writable folder");
     assert_eq!(RunConfig::read(&path).expect("an old file"), config);
+    // But it ends where a line ends.
+    std::fs::write(&path, old.trim_end()).expect("a writable folder");
+    let problem = RunConfig::read(&path).expect_err("the end may be missing");
+    assert!(brief(&problem) && problem.to_string().contains("its last line has no end"), "{problem}");
 }
 
 /// Learns for one step too many.

@@ -46,9 +46,11 @@ pub use probe::{Probe, Probed};
 
 use super::features::LatentFeatures;
 use crate::env::Spec;
+use crate::error::Result;
 use crate::nn::simnorm::sim_norm;
 use crate::nn::{Activation, Grad, Mlp, SymlogBins, TapeOps, Tensor3, device, parameters_of_fields};
 use crate::rng::Rng;
+use crate::settings::{Ranges, must_hold};
 
 /// Encoder, latent dynamics, reward head, an ensemble of Q functions, and the head that says when the task ends.
 #[doc(alias = "TD-MPC2")]
@@ -70,7 +72,21 @@ parameters_of_fields!(ImplicitModel: encoder, dynamics, reward, critics, termina
 
 impl ImplicitModel {
     /// A new model of environments with this specification. At first it predicts rewards and values of zero.
+    ///
+    /// # Errors
+    /// If a setting lies outside its range, or something is wrong with the specification.
+    pub fn try_new(spec: &Spec, config: &ImplicitConfig, rng: &mut Rng) -> Result<Self> {
+        config.check_at("model")?;
+        spec.check()?;
+        Ok(Self::new(spec, config, rng))
+    }
+
+    /// The same from settings that were checked, as those of an agent are.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn new(spec: &Spec, config: &ImplicitConfig, rng: &mut Rng) -> Self {
+        must_hold(config, "model");
         let cpu = device();
         let ImplicitConfig { latent, units, bins, .. } = *config;
         let features = LatentFeatures::new(spec);

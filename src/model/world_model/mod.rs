@@ -52,10 +52,12 @@ use super::features::LatentFeatures;
 use super::open_loop::{OpenLoopModel, actions_from};
 use super::rssm::{Latent, Rssm};
 use crate::env::Spec;
+use crate::error::Result;
 use crate::nn::kernels::sigmoid;
 use crate::nn::{Grad, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
 use crate::replay::Episode;
 use crate::rng::Rng;
+use crate::settings::{Ranges, must_hold};
 
 /// Particles for each start of an open-loop prediction.
 const PARTICLES: usize = 8;
@@ -80,7 +82,21 @@ parameters_of_fields!(WorldModel: encoder, rssm, decoder, reward, continuation a
 
 impl WorldModel {
     /// A new model of environments with this specification.
+    ///
+    /// # Errors
+    /// If a setting lies outside its range, or something is wrong with the specification.
+    pub fn try_new(spec: &Spec, config: &WorldModelConfig, rng: &mut Rng) -> Result<Self> {
+        config.check_at("world")?;
+        spec.check()?;
+        Ok(Self::new(spec, config, rng))
+    }
+
+    /// The same from settings that were checked, as those of an agent are.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn new(spec: &Spec, config: &WorldModelConfig, rng: &mut Rng) -> Self {
+        must_hold(config, "world");
         let cpu = device();
         let hidden = vec![config.units; config.layers];
         let features = config.rssm.features();

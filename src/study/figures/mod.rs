@@ -18,6 +18,13 @@ pub use learning::learning_curves;
 pub use test::tests;
 pub use training::{model, values};
 
+/// What the file names of a method's figures on a task begin with: different for any two of them. A task's name without a dash
+/// ends at the first one, and no name holds a dot.
+pub(super) fn stem(task: &str, method: &str) -> String {
+    let mark = if task.contains('-') { '.' } else { '-' };
+    format!("{task}{mark}{method}")
+}
+
 /// The methods that have the same colour of the palette in every study. Others take the colours that are left.
 const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "planet", "scripted", "random"];
 

@@ -28,7 +28,7 @@ enum Cell {
     /// What is not always there: nothing, or any number. A movement that never began has no smoothness, the error of a model
     /// that diverged is infinite.
     Measure,
-    /// The same, but a number lies between these two.
+    /// The same, but a number lies between these two, apart from rounding.
     Within(f64, f64),
 }
 
@@ -53,6 +53,8 @@ use Need::{Always, Optional};
 /// The table of a study names the run of each row; those of a single run do not.
 const LABELS: [(&str, Cell, Need); 3] =
     [("task", Cell::Name, Always), ("method", Cell::Name, Always), ("seed", Cell::Count(LIMIT), Always)];
+/// How far from its bounds a number may be computed.
+const ROUNDING: f64 = 1e-9;
 /// More than any run counts, and few enough for a float.
 const MANY: Cell = Cell::Count(1 << 53);
 
@@ -132,6 +134,12 @@ pub(super) fn of_study(path: &Path, layout: &Layout) -> Result<DataFrame> {
 fn read(path: &Path, layout: &Layout, labels: &[(&'static str, Cell, Need)]) -> Result<DataFrame> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
     let bad = |problem: String| Error::data(path)(problem);
+    // A number that lost its last digits is a number, too.
+    if bytes.last().is_some_and(|byte| *byte != b'\n') {
+        let problem =
+            "its last line has no end: the table was cut off; restore it, or end the line if nothing is missing";
+        return Err(bad(problem.into()));
+    }
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(bytes.as_slice());
     let header = reader.headers().map_err(|problem| bad(in_short(&problem)))?.clone();
     if header.is_empty() {
@@ -236,7 +244,7 @@ impl Cells {
                 let number: f64 = text.parse().map_err(|_| "it must be a number")?;
                 match cell {
                     Cell::Share if !(0.0..=1.0).contains(&number) => return Err("it must lie in [0, 1]".into()),
-                    Cell::Within(low, high) if !(number.is_nan() || (*low..=*high).contains(&number)) => {
+                    Cell::Within(low, high) if number < *low - ROUNDING || number > *high + ROUNDING => {
                         return Err(format!("it must lie in [{low}, {high}]"));
                     }
                     Cell::Number if !number.is_finite() => return Err("it must be finite".into()),
