@@ -162,6 +162,7 @@ mod tests {
         let n = 200_000;
         let squares: f64 = (0..n).map(|_| rng::truncated_normal(&mut rng).powi(2)).sum();
         let deviation = (squares / f64::from(n)).sqrt();
-        assert!((deviation - 0.879_625_66).abs() < 3e-3, "{deviation}");
+        // Five standard errors.
+        assert!((deviation - 0.879_625_66).abs() < 6e-3, "{deviation}");
     }
 }

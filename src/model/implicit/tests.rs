@@ -34,14 +34,18 @@ fn frozen_returns_are_those_of_the_model() {
         tensor(&device(), actions, (1, count, 1))
     };
     let start = tensor(model.device(), values(&z).repeat(count), (1, count, 24));
-    // Moves the head so that half of the rollouts end with the first step.
+    // Moves the head so that half of the rollouts end at some step.
     let ends = |model: &ImplicitModel, z: &Tensor3| {
         values(&model.termination.as_ref().expect("a head").forward(z.clone(), Grad::Input)).to_vec()
     };
-    let mut logits = ends(&model, &model.next(&mut NoneTape, &start, &column(0)));
-    logits.sort_by(f32::total_cmp);
+    let (mut state, mut highest) = (start.clone(), vec![f32::NEG_INFINITY; count]);
+    for t in 0..horizon {
+        state = model.next(&mut NoneTape, &state, &column(t));
+        highest.iter_mut().zip(ends(&model, &state)).for_each(|(highest, logit)| *highest = highest.max(logit));
+    }
+    highest.sort_by(f32::total_cmp);
     let mut heads = model.termination.parameters_mut();
-    values_mut(heads.last_mut().expect("the last bias").1)[0] -= logits[count / 2];
+    values_mut(heads.last_mut().expect("the last bias").1)[0] -= 0.5 * (highest[count / 2 - 1] + highest[count / 2]);
     let frozen = FrozenModel::new(&model, &policy);
     let found = frozen.returns(values(&z), &sequences, horizon, &noise, pair, discount);
     assert_eq!(found.len(), count);
