@@ -235,7 +235,7 @@ struct DoorEpisode {
 /// handle is turned, positions decide; from then on the finger slides as well. (Beyond 0.2 rad it slips off here
 /// and not there; the reference leaves out those steps, so it ends before the door counts as open.)
 #[test]
-fn the_door_opens_as_in_robosuite() {
+fn a_door_is_pressed_and_begins_to_open_as_in_robosuite() {
     // The reference knows the starts of three seeds; a shake moves them.
     if rng::shake() != 0 {
         return;
