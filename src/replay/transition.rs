@@ -42,7 +42,7 @@ pub struct Row<'a> {
     pub terminated: bool,
 }
 
-/// A minibatch of `size` transitions, each field row by row.
+/// A minibatch of `size` transitions, each of one time step or of several, each field row by row.
 #[derive(Clone, Debug, Default)]
 pub struct Batch {
     /// Rows.
@@ -51,12 +51,14 @@ pub struct Batch {
     pub obs: Vec<f32>,
     /// Actions, `[size, action]`.
     pub actions: Vec<f32>,
-    /// Rewards, `[size]`.
+    /// Rewards, `[size]`; of several time steps, their discounted sums.
     pub rewards: Vec<f32>,
-    /// Observations after the step, `[size, observation]`.
+    /// Observations after the last step, `[size, observation]`.
     pub next_obs: Vec<f32>,
     /// 1 where the task ended, else 0, `[size]`.
     pub terminated: Vec<f32>,
+    /// Time steps between `obs` and `next_obs`, `[size]`.
+    pub steps: Vec<usize>,
 }
 
 /// A ring buffer of the latest transitions.
@@ -142,17 +144,48 @@ impl ReplayBuffer {
     /// # Panics
     /// If the buffer is empty.
     pub fn sample(&self, size: usize, rng: &mut Rng) -> Batch {
+        self.sample_n_step(size, 1, 1.0, rng)
+    }
+
+    /// The same for n-step returns (Sutton and Barto 2018, section 7.1): `rewards` are sums over up to `n` time steps,
+    /// r_t + gamma r_{t+1} + ..., and `next_obs` comes after the last of them. There are fewer, `steps`, where the episode, or
+    /// what the buffer holds of it, ends before.
+    ///
+    /// # Panics
+    /// If the buffer is empty.
+    #[doc(alias = "multi-step return")]
+    pub fn sample_n_step(&self, size: usize, n: usize, gamma: f32, rng: &mut Rng) -> Batch {
         assert!(!self.is_empty(), "something to draw from");
         let mut batch = Batch { size, ..Batch::default() };
         for _ in 0..size {
-            let row = self.row(rng.random_range(0..self.len()));
+            let first = rng.random_range(0..self.len());
+            let mut row = self.row(first);
             batch.obs.extend(row.obs);
             batch.actions.extend(row.action);
-            batch.rewards.push(row.reward);
+            let (mut reward, mut weight, mut steps, mut index) = (row.reward, gamma, 1, first);
+            while steps < n
+                && let Some(next) = self.successor(index)
+            {
+                row = self.row(next);
+                reward += weight * row.reward;
+                weight *= gamma;
+                steps += 1;
+                index = next;
+            }
+            batch.rewards.push(reward);
             batch.next_obs.extend(row.next_obs);
             batch.terminated.push(f32::from(row.terminated));
+            batch.steps.push(steps);
         }
         batch
+    }
+
+    /// The index of the transition after the one at index `i`, if it belongs to the same episode: if it starts from the
+    /// observation at which the other ended.
+    fn successor(&self, i: usize) -> Option<usize> {
+        let next = (i + 1) % self.capacity;
+        let held = next < self.len() && self.serial(next) == self.serial(i) + 1;
+        (held && !self.row(i).terminated && self.row(next).obs == self.row(i).next_obs).then_some(next)
     }
 
     /// How many transitions may have been added, from those held.
@@ -194,10 +227,39 @@ impl ReplayBuffer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rng;
 
     fn numbered(i: u64) -> Transition {
         let (obs, next_obs) = (vec![i as f32], vec![i as f32 + 1.0]);
         Transition { obs, action: vec![0.0], reward: 0.0, next_obs, terminated: false, truncated: false }
+    }
+
+    /// Two episodes of three steps, the first cut off by its time limit, the second terminated, in a ring that has lost the
+    /// first transition.
+    #[test]
+    fn n_step_returns_end_with_their_episode() {
+        let mut buffer = ReplayBuffer::new(1, 1, 5);
+        for episode in 0..2 {
+            for t in 0..3 {
+                let at = |t: usize| vec![(10 * episode + t) as f32];
+                let (obs, next_obs, reward) = (at(t), at(t + 1), 1.0 + t as f32);
+                let (terminated, truncated) = (t == 2 && episode == 1, t == 2 && episode == 0);
+                buffer.push(&Transition { obs, action: vec![0.0], reward, next_obs, terminated, truncated });
+            }
+        }
+        let batch = buffer.sample_n_step(200, 2, 0.5, &mut rng::stream(0, "n-step"));
+        for i in 0..200 {
+            let of_row = (batch.rewards[i], batch.next_obs[i], batch.terminated[i], batch.steps[i]);
+            let expected = match batch.obs[i] as usize {
+                1 => (2.0 + 0.5 * 3.0, 3.0, 0.0, 2),
+                2 => (3.0, 3.0, 0.0, 1),
+                10 => (1.0 + 0.5 * 2.0, 12.0, 0.0, 2),
+                11 => (2.0 + 0.5 * 3.0, 13.0, 1.0, 2),
+                12 => (3.0, 13.0, 1.0, 1),
+                lost => panic!("{lost} is not in the ring any more"),
+            };
+            assert_eq!(of_row, expected);
+        }
     }
 
     /// Each transition keeps its serial number while it is in the ring, and in a checkpoint; an old checkpoint, which does

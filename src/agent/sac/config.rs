@@ -36,8 +36,21 @@ pub struct SacConfig {
     pub polyak: f32,
     /// Capacity of the replay buffer, in transitions.
     pub replay: usize,
-    /// Time steps of uniform random actions before the first update.
+    /// Time steps of random actions before the first update.
     pub warm_up: usize,
+    /// Exponent of those actions' coloured noise, as the methods that plan have it; uniform white noise if absent.
+    #[doc(alias = "pink noise")]
+    pub warm_up_noise_beta: Option<f64>,
+    /// Exponent of the noise with which the policy explores (1: pink noise, Eberhard et al. 2023); white if absent. The losses
+    /// are the same.
+    #[doc(alias = "pink noise")]
+    pub exploration_noise_beta: Option<f64>,
+    /// Whether the networks read what latent models read ([`LatentFeatures`](crate::model::features::LatentFeatures)): positions
+    /// relative to the hand, small distances magnified, cubes in canonical orientation.
+    pub latent_features: bool,
+    /// Time steps of reward in a target: n-step returns. The entropy of the steps between is left out.
+    #[doc(alias = "multi-step return")]
+    pub n_step: usize,
     /// Critic updates for each time step: the update-to-data ratio.
     #[doc(alias = "UTD")]
     pub updates_per_step: usize,
@@ -62,6 +75,10 @@ impl Default for SacConfig {
             polyak: 0.005,
             replay: 1_000_000,
             warm_up: 1000,
+            warm_up_noise_beta: None,
+            exploration_noise_beta: None,
+            latent_features: false,
+            n_step: 1,
             updates_per_step: 1,
             critic_updates_per_policy_update: 1,
             max_gradient_norm: None,
@@ -82,6 +99,10 @@ ranges!(SacConfig {
     polyak: 0.0..=1.0,
     replay: 1..=100_000_000,
     warm_up: 0..=1_000_000_000,
+    warm_up_noise_beta: 0.0..=10.0,
+    exploration_noise_beta: 0.0..=10.0,
+    latent_features: Any,
+    n_step: 1..=1000,
     updates_per_step: 1..=1000,
     critic_updates_per_policy_update: 1..=1_000_000,
     max_gradient_norm: 1e-6..=1e9,

@@ -7,7 +7,8 @@
 //!
 //! Deviations: log standard deviations are squashed into [-5, 2] as in CleanRL; the temperature's loss is
 //! -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
-//! and scaled by the environment's own [`Feature`](crate::env::Feature)s; truncated episodes are bootstrapped.
+//! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; truncated episodes
+//! are bootstrapped; returns may be of n steps; the policy may explore with coloured noise.
 
 mod checkpoint;
 mod config;
@@ -19,9 +20,11 @@ use dfdx::tensor::Cpu;
 pub use config::SacConfig;
 use temperature::Temperature;
 
+use super::warm_up::RandomActions;
 use super::{Agent, Losses, Mode, Slot};
 use crate::env::Spec;
 use crate::error::Result;
+use crate::model::features::LatentFeatures;
 use crate::nn::ops;
 use crate::nn::{
     Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, copy_parameters, device,
@@ -61,6 +64,8 @@ const MAX_INPUT: f32 = 10.0;
 pub struct Sac {
     config: SacConfig,
     cpu: Cpu,
+    /// What the networks read, if not each feature by itself.
+    features: Option<LatentFeatures>,
     /// Centre and scale of each feature of an observation.
     centre: Vec<f32>,
     scale: Vec<f32>,
@@ -77,6 +82,9 @@ pub struct Sac {
     replay: ReplayBuffer,
     observed: usize,
     updates: usize,
+    /// Coloured noise of the warm-up, and of the policy after it.
+    warm_up_noise: Option<RandomActions>,
+    exploration_noise: Option<RandomActions>,
     rng: Rng,
 }
 
@@ -91,9 +99,12 @@ impl Sac {
         let cpu = device();
         let mut rng = rng::stream(seed, "sac");
         let (observation_size, action_size) = (spec.observation_size(), spec.action_size);
+        let features = config.latent_features.then(|| LatentFeatures::new(spec));
+        let input = features.as_ref().map_or(observation_size, LatentFeatures::width);
+        let noise = |beta: Option<f64>| beta.map(|beta| RandomActions::new(beta, spec.horizon, action_size));
         let policy = MlpConfig {
             members: 1,
-            input: observation_size,
+            input,
             hidden: config.hidden.clone(),
             output: Some(2 * action_size),
             norm: Norm::None,
@@ -102,7 +113,7 @@ impl Sac {
         };
         let critics = MlpConfig {
             members: config.critics,
-            input: observation_size + action_size,
+            input: input + action_size,
             output: Some(1),
             norm: if config.layer_norm { Norm::Layer } else { Norm::None },
             ..policy.clone()
@@ -115,6 +126,7 @@ impl Sac {
         let optimiser =
             Adam::new(AdamConfig { max_norm: config.max_gradient_norm, ..AdamConfig::new(config.learning_rate) });
         Ok(Self {
+            features,
             centre: spec.observation.iter().map(|feature| feature.centre).collect(),
             scale: spec.observation.iter().map(|feature| feature.scale).collect(),
             action_size,
@@ -127,6 +139,8 @@ impl Sac {
             replay: ReplayBuffer::new(observation_size, action_size, config.replay),
             observed: 0,
             updates: 0,
+            warm_up_noise: noise(config.warm_up_noise_beta),
+            exploration_noise: noise(config.exploration_noise_beta),
             rng,
             cpu,
             config,
@@ -144,7 +158,8 @@ impl Sac {
     /// actions, in nats) and `temperature`; `critic_gradient` and `policy_gradient` are norms before clipping.
     #[doc(alias = "Bellman")]
     pub fn learn(&mut self) -> Losses {
-        let batch = self.replay.sample(self.config.batch, &mut self.rng);
+        let SacConfig { batch, n_step, discount, .. } = self.config;
+        let batch = self.replay.sample_n_step(batch, n_step, discount, &mut self.rng);
         let mut losses = self.update_critics(&batch);
         self.updates += 1;
         if self.updates.is_multiple_of(self.config.critic_updates_per_policy_update) {
@@ -218,8 +233,11 @@ impl Sac {
         values(&actions).chunks(self.action_size).map(<[f32]>::to_vec).collect()
     }
 
-    /// Observations as the networks' input, scaled: `[1, rows, observation]`.
+    /// Observations as the networks' input, scaled: `[1, rows, features]`.
     fn observations(&self, raw: &[f32]) -> Tensor3 {
+        if let Some(features) = &self.features {
+            return features.encode(&self.cpu, raw);
+        }
         let size = self.centre.len();
         let features = || self.centre.iter().zip(&self.scale);
         let mut scaled = Vec::with_capacity(raw.len());
@@ -239,15 +257,25 @@ impl Sac {
 }
 
 impl Agent for Sac {
+    fn begin_episode(&mut self) {
+        [&mut self.warm_up_noise, &mut self.exploration_noise].into_iter().flatten().for_each(RandomActions::reset);
+    }
+
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         if mode == Mode::Evaluate {
             return self.modes(obs).remove(0);
         }
         if self.observed < self.config.warm_up {
+            if let Some(noise) = &mut self.warm_up_noise {
+                return noise.next(&mut self.rng);
+            }
             return (0..self.action_size).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect();
         }
         let head = self.policy.forward(self.observations(obs), Grad::Input);
-        let noise = self.noise(1);
+        let noise = match &mut self.exploration_noise {
+            Some(noise) => tensor(&self.cpu, noise.deviates(&mut self.rng), (1, 1, self.action_size)),
+            None => self.noise(1),
+        };
         let (action, _) = SquashedGaussian::from_head(head).sample(noise);
         values(&action).to_vec()
     }
@@ -260,6 +288,9 @@ impl Agent for Sac {
     fn observe(&mut self, transition: &Transition) {
         self.replay.push(transition);
         self.observed += 1;
+        if transition.terminated || transition.truncated {
+            self.begin_episode();
+        }
     }
 
     fn update(&mut self) -> Option<Losses> {
@@ -274,15 +305,16 @@ impl Agent for Sac {
 /// The soft Bellman backup (equations 2 and 3), `[batch]`:
 ///
 /// ```text
-/// y = r + gamma (1 - terminated) (min Q(s', a') - alpha log pi(a'|s'))
+/// y = r + gamma^n (1 - terminated) (min Q(s', a') - alpha log pi(a'|s'))
 /// ```
 ///
-/// `q` is min Q(s', a') and `log_pi` is log pi(a'|s'). A truncated episode is bootstrapped, a terminated one is not.
+/// `q` is min Q(s', a') and `log_pi` is log pi(a'|s'), n time steps later; r is the sum of n rewards. A truncated episode is bootstrapped, a terminated one is not.
 #[doc(alias = "Bellman")]
 fn soft_bellman_backup(batch: &Batch, q: &[f32], log_pi: &[f32], temperature: f32, discount: f32) -> Vec<f32> {
     let soft_values = q.iter().zip(log_pi).map(|(q, log_pi)| q - temperature * log_pi);
-    let steps = batch.rewards.iter().zip(&batch.terminated).zip(soft_values);
-    steps.map(|((reward, terminated), value)| reward + discount * (1.0 - terminated) * value).collect()
+    let discounts = batch.steps.iter().map(|&n| discount.powi(n as i32));
+    let targets = batch.rewards.iter().zip(&batch.terminated).zip(discounts).zip(soft_values);
+    targets.map(|(((reward, terminated), discount), value)| reward + discount * (1.0 - terminated) * value).collect()
 }
 
 impl std::fmt::Debug for Sac {
@@ -302,8 +334,10 @@ mod tests {
 
     #[test]
     fn targets_bootstrap_unless_the_task_ended() {
-        let batch = Batch { size: 2, rewards: vec![1.0, -0.5], terminated: vec![0.0, 1.0], ..Batch::default() };
-        let y = soft_bellman_backup(&batch, &[4.5, 2.0], &[-0.8, 1.2], 0.2, 0.99);
+        let (rewards, terminated) = (vec![1.0, -0.5, 1.0], vec![0.0, 1.0, 0.0]);
+        let batch = Batch { size: 3, rewards, terminated, steps: vec![1, 1, 2], ..Batch::default() };
+        let y = soft_bellman_backup(&batch, &[4.5, 2.0, 4.5], &[-0.8, 1.2, -0.8], 0.2, 0.99);
         assert!((y[0] - 5.6134).abs() < 1e-6 && (y[1] + 0.5).abs() < 1e-6, "{y:?}");
+        assert!((y[2] - 5.567_266).abs() < 1e-5, "two steps: {y:?}");
     }
 }
