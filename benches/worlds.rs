@@ -1,4 +1,4 @@
-//! Control steps per second of the environments, on one core.
+//! Control steps per second of the environments: on one core, and of many environments on 1, 2, ... threads.
 //!
 //! Random actions touch table and cube now and then; with the cube in the hand, every step is contact.
 
@@ -6,8 +6,10 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use handful::env::tabletop::{ActionKind, TableOptions};
+use handful::env::vector::VectorEnv;
 use handful::env::{Env, Snapshot, Task, World};
 use handful::rng;
+use rayon::ThreadPoolBuilder;
 
 const STEPS: usize = 50;
 
@@ -25,7 +27,7 @@ fn endless(task: Task, action: ActionKind) -> World {
 fn steps(c: &mut Criterion) {
     let mut group = c.benchmark_group("control steps");
     group.throughput(Throughput::Elements(STEPS as u64)).sample_size(20);
-    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack] {
+    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door] {
         // robosuite's own action of seven numbers, so that the figures can be compared with robosuite's.
         let mut world = endless(task, ActionKind::Pose);
         world.reset(0);
@@ -55,6 +57,31 @@ fn steps(c: &mut Criterion) {
     group.finish();
 }
 
+/// 64 environments in lockstep: each step waits for the slowest.
+fn side_by_side(c: &mut Criterion) {
+    const ENVS: usize = 64;
+    let mut group = c.benchmark_group("64 lift environments");
+    group.throughput(Throughput::Elements((ENVS * STEPS) as u64)).sample_size(10);
+    let actions = random_actions(7, 100 * ENVS);
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    for threads in (0..).map(|i| 1 << i).take_while(|threads| *threads <= cores) {
+        let pool = ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
+        let mut envs = VectorEnv::new(ENVS, || endless(Task::Lift, ActionKind::Pose));
+        let seeds: Vec<u64> = (0..ENVS as u64).collect();
+        envs.reset(&seeds).expect("as many seeds as environments");
+        let mut steps = actions.chunks_exact(ENVS).cycle();
+        group.bench_function(format!("{threads} threads"), |b| {
+            b.iter(|| {
+                for actions in steps.by_ref().take(STEPS) {
+                    let actions: Vec<_> = actions.iter().cloned().map(Some).collect();
+                    pool.install(|| black_box(envs.step(&actions).expect("valid actions")));
+                }
+            });
+        });
+    }
+    group.finish();
+}
+
 fn states(c: &mut Criterion) {
     let mut group = c.benchmark_group("states");
     let mut world = Task::Lift.make();
@@ -75,5 +102,5 @@ fn states(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, steps, states);
+criterion_group!(benches, steps, side_by_side, states);
 criterion_main!(benches);

@@ -56,7 +56,11 @@ fn the_hybrid_trusts_no_slope_that_does_not_keep_its_word() {
 #[test]
 fn a_receding_horizon_plans_only_when_it_is_time() {
     let config = PlannerConfig::Shooting(ShootingConfig { horizon: HORIZON, population: 50 });
-    let mut control = RecedingHorizon::new(config.build(2), 2, &ControlConfig { action_repeat: 2, replan_every: 3 });
+    let mut control = RecedingHorizon::new(
+        config.build(2),
+        2,
+        &ControlConfig { action_repeat: 2, replan_every: 3, ..ControlConfig::default() },
+    );
     let mut rng = rng::stream(0, "receding");
     let mut plans = 0;
     let target = target();
@@ -173,7 +177,7 @@ fn proposals_guide_a_short_search() {
 
     let held: Vec<f32> = target().chunks(2).flat_map(|action| action.repeat(3)).collect();
     let planner = PlannerConfig::Guided(GuidedConfig { proposals: 4, ..config }).build(2);
-    let mut control = RecedingHorizon::new(planner, 2, &ControlConfig { action_repeat: 3, replan_every: 1 });
+    let mut control = RecedingHorizon::new(planner, 2, &ControlConfig { action_repeat: 3, ..ControlConfig::default() });
     let action = control.act(&mut Knowing(held), &mut |_| {}, &mut rng::stream(0, "held"));
     assert_eq!(action, target()[..2]);
 }
@@ -287,7 +291,7 @@ fn bang_bang(action_size: usize) -> BangBang {
 
 #[test]
 fn a_planner_of_ones_own_enters_receding_horizon_control() {
-    let config = ControlConfig { action_repeat: 2, replan_every: 4 };
+    let config = ControlConfig { action_repeat: 2, replan_every: 4, ..ControlConfig::default() };
     let mut control = RecedingHorizon::new(bang_bang.make(1), 1, &config);
     let mut plans = 0;
     for _ in 0..16 {

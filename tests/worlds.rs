@@ -1,5 +1,6 @@
 //! The tasks: they can be solved, they can be restored, they survive anything.
 
+use handful::env::tabletop::helpers::{log_reaching_reward, reaching_reward};
 use handful::env::tabletop::{ActionKind, ObservationKind, RewardKind, TableOptions};
 use handful::env::vector::VectorEnv;
 use handful::env::{Env, KnownReward, Snapshot, Step, Task, World};
@@ -271,6 +272,35 @@ fn options_change_what_they_say() {
         assert_eq!(env.spec().observation_size(), objects + 50);
     }
     assert!(matches!(Task::Pendulum.make_with(sparse), Err(Error::Config(_))));
+}
+
+/// The logarithm of the shaped reward, where that is one distance; on all tasks, more at success than at the start, and a pull
+/// towards the goal from afar, where the shaped reward has none.
+#[test]
+fn the_reward_in_logarithm_pulls_from_afar() {
+    let log = TableOptions { reward: RewardKind::Log, ..TableOptions::default() };
+    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door] {
+        let (mut shaped, mut env) = (task.make(), task.make_with(log).expect("an arm task"));
+        let policy = task.scripted_policy(log).expect("each has one");
+        let mut obs = env.reset(0);
+        shaped.reset(0);
+        let first = env.reward(&obs, &[0.0; 4], &obs);
+        let mut last = None;
+        for _ in 0..env.spec().horizon {
+            let action = policy(&obs);
+            let (paid, step) = (shaped.step(&action).expect("valid"), env.step(&action).expect("valid"));
+            assert_eq!(env.reward(&obs, &action, &step.observation), step.reward);
+            if task == Task::Reach {
+                assert!((step.reward - paid.reward.ln()).abs() < 1e-3, "{} and {}", step.reward, paid.reward);
+            }
+            obs = step.observation;
+            last = Some((step.reward, step.success));
+        }
+        let (reward, success) = last.expect("an episode has steps");
+        assert!(!success || reward > first + 0.5, "{task}: {first} at the start, {reward} at success");
+    }
+    let slope = |distance: f64| log_reaching_reward(distance) - log_reaching_reward(distance + 0.01);
+    assert!((slope(0.5) - 0.2).abs() < 1e-3 && reaching_reward(0.5) - reaching_reward(0.51) < 1e-4);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 
+use nalgebra::{RealField, convert};
 use serde::{Deserialize, Serialize};
 
 use super::{ActionSequences, Iteration, Objective, PlanObserver, Planner, PlannerConfig};
@@ -19,15 +20,30 @@ pub struct ControlConfig {
     pub action_repeat: usize,
     /// Planned actions that are executed before the next plan is made.
     pub replan_every: usize,
+    /// The actions between one planned action and the next, if `action_repeat` is more than 1.
+    pub interpolation: Interpolation,
+}
+
+/// How a plan of few actions becomes one of more control steps: a spline whose knots are the planned actions.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Interpolation {
+    /// Each planned action is held until the next (a spline of order zero).
+    #[default]
+    #[doc(alias = "zero-order hold")]
+    Hold,
+    /// From the last executed action in a straight line to the first planned one, which is reached after `action_repeat`
+    /// control steps, and so on: the hand's motion has no jumps between planned actions.
+    Linear,
 }
 
 impl Default for ControlConfig {
     fn default() -> Self {
-        Self { action_repeat: 1, replan_every: 1 }
+        Self { action_repeat: 1, replan_every: 1, interpolation: Interpolation::Hold }
     }
 }
 
-ranges!(ControlConfig { action_repeat: 1..=1000, replan_every: 1..=1000 });
+ranges!(ControlConfig { action_repeat: 1..=1000, replan_every: 1..=1000, interpolation: Any });
 
 impl ControlConfig {
     /// Whether a plan holds what is executed of it.
@@ -72,6 +88,8 @@ pub struct RecedingHorizon {
     action_size: usize,
     /// What is left to execute of the plan, in control steps.
     queue: VecDeque<f32>,
+    /// The last executed action; zeros before the first.
+    last: Vec<f32>,
 }
 
 impl RecedingHorizon {
@@ -80,19 +98,21 @@ impl RecedingHorizon {
     /// # Panics
     /// If `action_repeat` or `replan_every` is 0.
     pub fn new(planner: Box<dyn Planner>, action_size: usize, config: &ControlConfig) -> Self {
-        let ControlConfig { action_repeat, replan_every } = *config;
+        let ControlConfig { action_repeat, replan_every, .. } = *config;
         assert!(action_repeat > 0 && replan_every > 0, "`action_repeat` and `replan_every` must be at least 1");
-        Self { config: config.clone(), planner, action_size, queue: VecDeque::new() }
+        let last = vec![0.0; action_size];
+        Self { config: config.clone(), planner, action_size, queue: VecDeque::new(), last }
     }
 
     /// Forgets everything: a new episode begins.
     pub fn reset(&mut self) {
         self.planner.reset();
         self.queue.clear();
+        self.last.fill(0.0);
     }
 
     /// The next action. Plans if nothing is left of the last plan. The objective is asked about sequences of control steps,
-    /// in which each planned action is repeated; the observer sees control steps, too.
+    /// between the planned actions as [`Interpolation`] says; the observer sees control steps, too.
     ///
     /// # Panics
     /// If the planner's plan is shorter than `replan_every` actions.
@@ -101,22 +121,24 @@ impl RecedingHorizon {
     #[doc(alias = "model predictive control")]
     pub fn act(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Vec<f32> {
         if self.queue.is_empty() {
-            let ControlConfig { action_repeat, replan_every } = self.config;
+            let replan_every = self.config.replan_every;
+            let spline = Spline { config: &self.config, start: &self.last };
             let mut observe = |iteration: &Iteration| {
                 let Iteration { index, candidates, returns, mean } = *iteration;
-                let mean: Vec<f64> = repeated(mean, self.action_size, action_repeat);
-                let candidates = &in_control_steps(candidates, action_repeat);
+                let mean: Vec<f64> = spline.interpolate(mean);
+                let candidates = &spline.in_control_steps(candidates);
                 observer(&Iteration { index, candidates, returns, mean: &mean });
             };
-            let plan = self.planner.plan(&mut Repeated { objective, action_repeat }, &mut observe, rng);
+            let plan = self.planner.plan(&mut Interpolated { objective, spline }, &mut observe, rng);
             self.planner.shift(replan_every);
             let executed = plan.actions.get(..replan_every * self.action_size).unwrap_or_else(|| {
                 let numbers = plan.actions.len();
                 panic!("`replan_every` is {replan_every}, but the planner's plan has {numbers} numbers only")
             });
-            self.queue.extend(repeated(executed, self.action_size, action_repeat));
+            self.queue.extend(spline.interpolate(executed));
         }
-        self.queue.drain(..self.action_size).collect()
+        self.last = self.queue.drain(..self.action_size).collect();
+        self.last.clone()
     }
 }
 
@@ -131,44 +153,137 @@ impl std::fmt::Debug for RecedingHorizon {
     }
 }
 
-/// An objective of control steps, asked about actions that are each repeated.
-struct Repeated<'a> {
-    objective: &'a mut dyn Objective,
-    action_repeat: usize,
+/// The control steps of planned actions.
+#[derive(Clone, Copy)]
+struct Spline<'a> {
+    config: &'a ControlConfig,
+    /// The action before the first planned one.
+    start: &'a [f32],
 }
 
-impl Objective for Repeated<'_> {
+impl Spline<'_> {
+    /// `action_repeat` control steps for each planned action.
+    fn interpolate<T: RealField + Copy>(&self, actions: &[T]) -> Vec<T> {
+        let start: Vec<T> = self.start.iter().map(|&a| convert(f64::from(a))).collect();
+        let mut steps = Vec::with_capacity(actions.len() * self.config.action_repeat);
+        let mut before = start.as_slice();
+        for action in actions.chunks_exact(self.start.len()) {
+            for step in 1..=self.config.action_repeat {
+                match self.config.interpolation {
+                    Interpolation::Hold => steps.extend(action),
+                    Interpolation::Linear => {
+                        let weight = convert(self.weight(step));
+                        steps.extend(before.iter().zip(action).map(|(&b, &a)| b + (a - b) * weight));
+                    }
+                }
+            }
+            before = action;
+        }
+        steps
+    }
+
+    /// The part that a planned action has in the control step `step` (from 1) of those that lead to it; the action before
+    /// has the rest.
+    fn weight(&self, step: usize) -> f64 {
+        match self.config.interpolation {
+            Interpolation::Hold => 1.0,
+            Interpolation::Linear => step as f64 / self.config.action_repeat as f64,
+        }
+    }
+
+    fn in_control_steps(&self, sequences: &ActionSequences) -> ActionSequences {
+        ActionSequences {
+            horizon: sequences.horizon * self.config.action_repeat,
+            actions: sequences.actions,
+            values: sequences.rows().flat_map(|row| self.interpolate(row)).collect(),
+        }
+    }
+}
+
+/// An objective of control steps, asked about planned actions.
+struct Interpolated<'a> {
+    objective: &'a mut dyn Objective,
+    spline: Spline<'a>,
+}
+
+impl Objective for Interpolated<'_> {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
-        self.objective.returns(&in_control_steps(sequences, self.action_repeat))
+        self.objective.returns(&self.spline.in_control_steps(sequences))
     }
 
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
-        let (returns, gradients) = self.objective.gradients(&in_control_steps(sequences, self.action_repeat));
-        // By the chain rule, the gradient of a repeated action is the sum over its repetitions.
-        let of_actions = gradients.chunks_exact(self.action_repeat * sequences.actions).flat_map(|steps| {
-            (0..sequences.actions).map(|i| steps.iter().skip(i).step_by(sequences.actions).sum::<f32>())
-        });
-        (returns, of_actions.collect())
+        let (returns, gradients) = self.objective.gradients(&self.spline.in_control_steps(sequences));
+        // By the chain rule: a planned action has a part in the steps that lead to it, and in those that lead from it.
+        let ActionSequences { horizon, actions, .. } = *sequences;
+        let repeat = self.spline.config.action_repeat;
+        let mut planned = vec![0.0; sequences.values.len()];
+        for (planned, steps) in
+            planned.chunks_exact_mut(horizon * actions).zip(gradients.chunks_exact(repeat * horizon * actions))
+        {
+            for (t, gradient) in steps.chunks_exact(actions).enumerate() {
+                let (knot, weight) = (t / repeat, self.spline.weight(t % repeat + 1) as f32);
+                for (i, g) in gradient.iter().enumerate() {
+                    planned[knot * actions + i] += weight * g;
+                    if knot > 0 {
+                        planned[(knot - 1) * actions + i] += (1.0 - weight) * g;
+                    }
+                }
+            }
+        }
+        (returns, planned)
     }
 
     fn proposals(&mut self, count: usize, like: &ActionSequences) -> ActionSequences {
         let ActionSequences { horizon, actions, .. } = *like;
-        let proposed = self.objective.proposals(count, &ActionSequences::new(horizon * self.action_repeat, actions));
-        // The first of the steps for which an action is held.
-        let held = proposed.values.chunks_exact(actions).step_by(self.action_repeat);
-        ActionSequences { values: held.flatten().copied().collect(), ..like.clone() }
+        let repeat = self.spline.config.action_repeat;
+        let proposed = self.objective.proposals(count, &ActionSequences::new(horizon * repeat, actions));
+        // The step at which a planned action is reached.
+        let reached = match self.spline.config.interpolation {
+            Interpolation::Hold => 0,
+            Interpolation::Linear => repeat - 1,
+        };
+        let planned = proposed.values.chunks_exact(actions).skip(reached).step_by(repeat);
+        ActionSequences { values: planned.flatten().copied().collect(), ..like.clone() }
     }
 }
 
-fn in_control_steps(sequences: &ActionSequences, action_repeat: usize) -> ActionSequences {
-    ActionSequences {
-        horizon: sequences.horizon * action_repeat,
-        actions: sequences.actions,
-        values: repeated(&sequences.values, sequences.actions, action_repeat),
-    }
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-/// Each action `action_repeat` times in a row.
-fn repeated<T: Copy>(values: &[T], action_size: usize, action_repeat: usize) -> Vec<T> {
-    values.chunks_exact(action_size).flat_map(|action| action.repeat(action_repeat)).collect()
+    fn spline(interpolation: Interpolation) -> ControlConfig {
+        ControlConfig { action_repeat: 2, interpolation, ..ControlConfig::default() }
+    }
+
+    #[test]
+    fn planned_actions_are_held_or_reached_in_a_straight_line() {
+        let of = |interpolation| Spline { config: &spline(interpolation), start: &[0.5] }.interpolate(&[1.0_f32, 0.0]);
+        assert_eq!(of(Interpolation::Hold), [1.0, 1.0, 0.0, 0.0]);
+        assert_eq!(of(Interpolation::Linear), [0.75, 1.0, 0.5, 0.0]);
+    }
+
+    #[test]
+    fn gradients_are_those_of_the_planned_actions() {
+        for interpolation in [Interpolation::Hold, Interpolation::Linear] {
+            let config = spline(interpolation);
+            let mut rng = crate::rng::stream(0, "interpolation");
+            let weights: Vec<f32> = (0..12).map(|_| crate::rng::normal(&mut rng) as f32).collect();
+            let mut linear = |c: &ActionSequences| -> Vec<f32> {
+                c.rows().map(|row| row.iter().zip(&weights).map(|(a, w)| a * w).sum()).collect()
+            };
+            let mut objective =
+                Interpolated { objective: &mut linear, spline: Spline { config: &config, start: &[0.1, 0.2] } };
+            let plans = ActionSequences { horizon: 3, actions: 2, values: vec![0.3, -0.2, 0.1, 0.5, -0.6, 0.4] };
+            let (_, gradients) = objective.gradients(&plans);
+            for (i, gradient) in gradients.iter().enumerate() {
+                let mut at = |step: f32| {
+                    let mut plans = plans.clone();
+                    plans.values[i] += step;
+                    objective.returns(&plans)[0]
+                };
+                let difference = at(0.5) - at(-0.5);
+                assert!((difference - gradient).abs() < 1e-3, "{interpolation:?}: {difference}, {gradient}");
+            }
+        }
+    }
 }

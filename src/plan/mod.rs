@@ -50,7 +50,7 @@ mod shooting;
 
 pub use cem::{Cem, CemConfig};
 pub use config::PlannerConfig;
-pub use control::{ControlConfig, RecedingHorizon};
+pub use control::{ControlConfig, Interpolation, RecedingHorizon};
 pub use gradient::{Gradient, GradientConfig};
 pub use guided::{GuidedConfig, GuidedMppi};
 pub use hybrid::{Hybrid, HybridConfig};

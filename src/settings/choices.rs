@@ -176,8 +176,9 @@ mod tests {
 
     #[test]
     fn a_type_tells_where_it_has_a_choice() {
-        assert_eq!(choices::<PetsConfig>("pets"), ["pets.planner", "pets.propagation", "pets.risk"]);
-        assert_eq!(choices::<DreamerConfig>("dreamer"), ["dreamer.planner"]);
+        let of_pets = ["pets.planner", "pets.control.interpolation", "pets.propagation", "pets.risk"];
+        assert_eq!(choices::<PetsConfig>("pets"), of_pets);
+        assert_eq!(choices::<DreamerConfig>("dreamer"), ["dreamer.planner", "dreamer.control.interpolation"]);
         assert!(choices::<SacConfig>("sac").is_empty());
     }
 }

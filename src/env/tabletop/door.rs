@@ -5,8 +5,8 @@ use std::f64::consts::FRAC_PI_2;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
 
 use super::helpers::{
-    GRIPPER, action_towards, difference_features, gripper_features, gripper_values, named_values, reaching_reward,
-    vector_at, xyz_features,
+    GRIPPER, action_towards, difference_features, gripper_features, gripper_values, log_reaching_reward, named_values,
+    reaching_reward, vector_at, xyz_features,
 };
 use super::task::{Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
@@ -124,6 +124,14 @@ impl TableTask for Door {
                 usize::from(distance < 0.06)
             },
         }
+    }
+
+    /// With the door's angle, too, about which robosuite's shaping is silent until the door is open.
+    fn log_shaped(&self, obs: &[f32]) -> f64 {
+        let TaskOutcome { shaped, success, .. } = self.outcome(obs);
+        let distance = vector_at(obs, HAND_TO_HANDLE).norm();
+        let near = 0.25 * (log_reaching_reward(distance) - reaching_reward(distance));
+        if success { shaped } else { shaped + near + 0.5 * f64::from(obs[ANGLE]) / OPEN }
     }
 
     /// Above the handle's end, down on it until it is turned, then back with it: the handle's spring presses it against the

@@ -16,6 +16,7 @@
 //! assert!((reaching_reward(0.1) - 0.24).abs() < 0.01);
 //! ```
 
+use std::f64::consts::LN_2;
 use std::ops::Range;
 
 use nalgebra::{UnitQuaternion, Vector3};
@@ -107,6 +108,13 @@ pub fn grasped(obs: &[f32]) -> bool {
 #[doc(alias = "reward shaping")]
 pub fn reaching_reward(distance: f64) -> f64 {
     1.0 - (10.0 * distance).tanh()
+}
+
+/// The logarithm of [`reaching_reward`]: 0 at distance zero, -1.4 at 10 cm, and from there on 2 less with every 10 cm, where
+/// the other is flat.
+pub fn log_reaching_reward(distance: f64) -> f64 {
+    // 1 - tanh(x) = 2 / (1 + exp(2 x))
+    LN_2 - (20.0 * distance) - (-20.0 * distance).exp().ln_1p()
 }
 
 /// The action of a proportional controller that moves the hand by `way` (m); it is saturated beyond 7 cm. `grip` is the

@@ -4,7 +4,8 @@ use nalgebra::Vector3;
 
 use super::helpers::{
     GRIPPER, action_to_grasp, action_towards, difference_features, grasped, gripper_features, gripper_values,
-    object_features, object_values, pose_on_table, reaching_reward, robosuite_object_state, vector_at,
+    log_reaching_reward, object_features, object_values, pose_on_table, reaching_reward, robosuite_object_state,
+    vector_at,
 };
 use super::task::{Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
@@ -77,6 +78,12 @@ impl TableTask for Lift {
                 usize::from(distance < 0.02)
             },
         }
+    }
+
+    fn log_shaped(&self, obs: &[f32]) -> f64 {
+        let TaskOutcome { shaped, success, .. } = self.outcome(obs);
+        let distance = vector_at(obs, HAND_TO_CUBE).norm();
+        if success { shaped } else { shaped + (log_reaching_reward(distance) - reaching_reward(distance)) / 2.25 }
     }
 
     fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {

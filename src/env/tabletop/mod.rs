@@ -220,9 +220,10 @@ impl Tabletop {
         }
     }
 
-    fn reward_of(&self, outcome: TaskOutcome) -> f32 {
+    fn reward_of(&self, outcome: TaskOutcome, obs: &[f32]) -> f32 {
         match self.options.reward {
             RewardKind::Shaped => outcome.shaped as f32,
+            RewardKind::Log => self.task.log_shaped(obs) as f32,
             RewardKind::Sparse => f32::from(outcome.success),
         }
     }
@@ -266,7 +267,7 @@ impl Env for Tabletop {
         let observation = self.observe();
         let outcome = self.task.outcome(&self.state.compact);
         let truncated = self.state.elapsed >= self.spec.horizon;
-        let step = Step::new(observation, self.reward_of(outcome)).truncated(truncated);
+        let step = Step::new(observation, self.reward_of(outcome, &self.state.compact)).truncated(truncated);
         Ok(step.success(outcome.success).stage(outcome.stage))
     }
 
@@ -303,7 +304,7 @@ impl KnownReward for Tabletop {
     /// If the reward is not known ([`KnownReward::is_known`]).
     fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
         assert!(self.is_known(), "the reward needs compact observations");
-        self.reward_of(self.task.outcome(next_obs))
+        self.reward_of(self.task.outcome(next_obs), next_obs)
     }
 }
 

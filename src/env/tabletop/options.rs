@@ -12,6 +12,9 @@ pub enum RewardKind {
     /// A number in [0, 1] that grows along the way to success.
     #[default]
     Shaped,
+    /// The shaped reward with distances in logarithm ([`log_reaching_reward`](super::helpers::log_reaching_reward)), so that
+    /// what is far away still pulls. For planners: see [`TableOptions::planning_reward`].
+    Log,
     /// 1 at success, else 0.
     Sparse,
 }
@@ -55,8 +58,11 @@ pub enum ObservationKind {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TableOptions {
-    /// Shaped or sparse reward.
+    /// The reward that the environment pays.
     pub reward: RewardKind,
+    /// The reward that planners maximise which are given one (the oracle, and PETS unless it learns the reward); the same if
+    /// absent. Results are measured with `reward` all the same.
+    pub planning_reward: Option<RewardKind>,
     /// The meaning of an action.
     pub action: ActionKind,
     /// The contents of an observation.
@@ -65,9 +71,14 @@ pub struct TableOptions {
     pub horizon: Option<usize>,
 }
 
-ranges!(TableOptions { reward: Any, action: Any, observation: Any, horizon: 1..=10_000 });
+ranges!(TableOptions { reward: Any, planning_reward: Any, action: Any, observation: Any, horizon: 1..=10_000 });
 
 impl TableOptions {
+    /// The options of the environments that planners try actions in, or take the reward from.
+    pub(crate) fn of_planning(&self) -> Self {
+        Self { reward: self.planning_reward.unwrap_or(self.reward), ..*self }
+    }
+
     /// A hand motion and gripper command (dx, dy, dz, grip), clipped to [-1, 1], as the action that these options ask for.
     pub(in crate::env) fn action_of_hand(&self, hand: [f64; 4]) -> Vec<f32> {
         let [x, y, z, grip] = hand.map(|a| a.clamp(-1.0, 1.0) as f32);

@@ -5,8 +5,8 @@
 use nalgebra::Vector3;
 
 use super::helpers::{
-    action_towards, cube_features, difference_features, named_values, object_values, pose_on_table, reaching_reward,
-    robosuite_object_state, vector_at, xyz_features,
+    action_towards, cube_features, difference_features, log_reaching_reward, named_values, object_values,
+    pose_on_table, reaching_reward, robosuite_object_state, vector_at, xyz_features,
 };
 use super::task::{HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
@@ -94,6 +94,12 @@ impl TableTask for Push {
         let shaped =
             if success { 1.0 } else { 0.25 * reaching_reward(hand_to_cube) + 0.75 * reaching_reward(cube_to_goal) };
         TaskOutcome { shaped, success, stage: if success { 2 } else { usize::from(hand_to_cube < 0.05) } }
+    }
+
+    fn log_shaped(&self, obs: &[f32]) -> f64 {
+        let hand_to_cube = vector_at(obs, HAND_TO_CUBE).norm();
+        let cube_to_goal = vector_at(obs, CUBE_TO_GOAL).norm();
+        0.25 * log_reaching_reward(hand_to_cube) + 0.75 * log_reaching_reward(cube_to_goal)
     }
 
     /// Behind the cube as seen from the goal, down, and through it towards the goal.

@@ -4,7 +4,9 @@
 
 use nalgebra::Vector3;
 
-use super::helpers::{action_towards, difference_features, named_values, reaching_reward, vector_at, xyz_features};
+use super::helpers::{
+    action_towards, difference_features, log_reaching_reward, named_values, reaching_reward, vector_at, xyz_features,
+};
 use super::task::{HAND_VELOCITY, Setup, TableTask, TaskOutcome, TaskView};
 use crate::env::Feature;
 use crate::env::physics::Physics;
@@ -65,6 +67,10 @@ impl TableTask for Reach {
             success: distance < TOLERANCE,
             stage: usize::from(distance < 0.05) + usize::from(distance < TOLERANCE),
         }
+    }
+
+    fn log_shaped(&self, obs: &[f32]) -> f64 {
+        log_reaching_reward(vector_at(obs, HAND_TO_GOAL).norm())
     }
 
     fn scripted(&self, obs: &[f32]) -> Option<[f64; 4]> {

@@ -4,7 +4,8 @@ use nalgebra::Vector3;
 
 use super::helpers::{
     GRIPPER, action_to_grasp, action_towards, cube_features, difference_features, grasped, gripper_features,
-    gripper_values, named_values, object_values, pose_on_table, reaching_reward, robosuite_object_state, vector_at,
+    gripper_values, log_reaching_reward, named_values, object_values, pose_on_table, reaching_reward,
+    robosuite_object_state, vector_at,
 };
 use super::lift::{CUBE, LIFTED};
 use super::task::{Setup, TableTask, TaskOutcome, TaskView};
@@ -108,6 +109,21 @@ impl TableTask for Stack {
             } else {
                 usize::from(distance < 0.02)
             },
+        }
+    }
+
+    /// With the distance between the cube and its place on the base, where robosuite's term is nearly flat.
+    fn log_shaped(&self, obs: &[f32]) -> f64 {
+        let TaskOutcome { success, .. } = self.outcome(obs);
+        let grasped = if grasped(obs) { 0.25 } else { 0.0 };
+        let lifted = vector_at(obs, CUBE).z > TABLE_TOP + LIFTED;
+        let to_place = vector_at(obs, CUBE_TO_BASE) + Vector3::z() * (HALF[0] + HALF[1]);
+        if success {
+            1.0
+        } else if lifted {
+            (1.5 + 0.25 * log_reaching_reward(to_place.norm())) / 2.0
+        } else {
+            (0.25 * log_reaching_reward(vector_at(obs, HAND_TO_CUBE).norm()) + grasped) / 2.0
         }
     }
 

@@ -87,6 +87,12 @@ pub trait TableTask: Send + Sync {
     /// it from predicted observations.
     fn outcome(&self, obs: &[f32]) -> TaskOutcome;
 
+    /// The reward of [`RewardKind::Log`](super::RewardKind::Log): that of [`TableTask::outcome`] with distances in
+    /// logarithm. The shaped reward itself by default.
+    fn log_shaped(&self, obs: &[f32]) -> f64 {
+        self.outcome(obs).shaped
+    }
+
     /// The bodies to draw: one for each object, in the order of [`Setup::objects`], then one for the goal if there is one.
     fn drawn(&self, setup: &Setup) -> Vec<Body>;
 

@@ -36,6 +36,7 @@ pub struct EnvEntry<E, O = NoOptions> {
     name: String,
     check: Check,
     make: Make<O, E>,
+    make_for_planning: Make<O, E>,
     known_reward: Option<Make<O, Option<SharedReward>>>,
     oracle: Option<MakeOracle<O>>,
     scripted: Option<Make<O, Scripted>>,
@@ -58,9 +59,25 @@ impl<E: Env> EnvEntry<E> {
 impl<E: Env, O: Settings> EnvEntry<E, O> {
     /// An environment with options.
     pub fn with_options(name: &str, make: impl Fn(&O) -> Result<E> + Send + Sync + 'static) -> Self {
-        let make = Arc::new(make);
+        let make: Make<O, E> = Arc::new(make);
         let check: Check = |_, _| Ok(());
-        Self { name: name.into(), check, make, known_reward: None, oracle: None, scripted: None, env: PhantomData }
+        Self {
+            name: name.into(),
+            check,
+            make_for_planning: make.clone(),
+            make,
+            known_reward: None,
+            oracle: None,
+            scripted: None,
+            env: PhantomData,
+        }
+    }
+
+    /// The known reward and the oracle, from here on, have other options than the environment that the agent acts in.
+    fn planning_with(mut self, options: impl Fn(&O) -> O + Send + Sync + 'static) -> Self {
+        let make = self.make.clone();
+        self.make_for_planning = Arc::new(move |o| make(&options(o)));
+        self
     }
 
     /// Its options have ranges, which are checked before anything is made.
@@ -86,7 +103,7 @@ impl<E: Env, O: Settings> EnvEntry<E, O> {
     where
         E: KnownReward + Sync,
     {
-        let make = self.make.clone();
+        let make = self.make_for_planning.clone();
         self.known_reward = Some(Arc::new(move |options: &O| {
             Ok(if known(options) { Some(Arc::new(make(options)?) as SharedReward) } else { None })
         }));
@@ -99,7 +116,7 @@ impl<E: Env, O: Settings> EnvEntry<E, O> {
     where
         E: Snapshot,
     {
-        let make = self.make.clone();
+        let make = self.make_for_planning.clone();
         self.oracle = Some(Arc::new(move |options: &O, config, seed| {
             Ok(Method::fixed(Oracle::new(|| make(options), config, seed)?))
         }));
@@ -124,6 +141,7 @@ impl EnvEntry<Tabletop, TableOptions> {
         };
         Self::with_options(task.name(), make.clone())
             .with_ranges()
+            .planning_with(TableOptions::of_planning)
             .with_known_reward_if(|options| options.observation == ObservationKind::Compact)
             .with_oracle()
             .with_scripted(move |options| {
@@ -197,6 +215,7 @@ pub(super) fn register(registry: Registry) -> Registry {
     Task::ALL.into_iter().fold(registry, |registry, task| {
         let entry = EnvEntry::with_options(task.name(), move |options: &TableOptions| task.make_with(*options))
             .with_ranges()
+            .planning_with(TableOptions::of_planning)
             .with_known_reward_if(|options| options.observation == ObservationKind::Compact)
             .with_oracle();
         let scripted = task.scripted_policy(TableOptions::default()).is_some();
