@@ -166,6 +166,37 @@ fn gradients_of_normalisation() {
     }
 }
 
+/// For one draw of what is dropped, the gradients of normalised critics with dropout (DroQ) are those of the function that is left.
+#[test]
+fn gradients_of_a_network_with_dropout() {
+    let config = MlpConfig {
+        members: 2,
+        input: 3,
+        hidden: vec![12, 12],
+        output: Some(1),
+        norm: Norm::Layer,
+        activation: Activation::Mish,
+        init: Init::Uniform,
+    };
+    let network = Mlp::new(&device(), &config, &mut rng::stream(4, "network"));
+    let mut parameters: Vec<Tensor3> = network.parameters().into_iter().map(|(_, p)| p.clone()).collect();
+    parameters.insert(0, random((1, 5, 3), &mut rng::stream(4, "x")));
+    let weights = random((2, 5, 1), &mut rng::stream(4, "weights"));
+    check_gradients(parameters, |given, taped| {
+        let mut network = network.clone();
+        network.parameters_mut().into_iter().zip(&given[1..]).for_each(|((_, p), given)| *p = given.clone());
+        let dropped = &mut rng::stream(4, "dropout");
+        if taped {
+            let x = given[0].clone().leaky_traced();
+            let loss = scalar(network.forward_with_dropout(x, Grad::Both, 0.3, dropped), &weights);
+            (loss.array(), Some(loss.backward()))
+        } else {
+            let y = network.forward_with_dropout(given[0].clone(), Grad::Both, 0.3, dropped);
+            (scalar(y, &weights).array(), None)
+        }
+    });
+}
+
 /// Numbers computed in float64 from the reference's formula.
 #[test]
 fn root_mean_square_normalisation_is_the_references() {

@@ -4,6 +4,7 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use serde::{Deserialize, Serialize};
 
+use super::dropout::dropout;
 use super::frozen::{After, FrozenMlp};
 use super::ops::{self, Grad, Tensor3, values, values_mut};
 use super::parameters::Parameters;
@@ -246,18 +247,44 @@ impl Mlp {
     /// The outputs `[members, batch, output]` for `x` (`[members or 1, batch, input]`), whose tape they take over. An input
     /// of one member is given to all networks.
     pub fn forward<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, grad: Grad) -> Tensor3<T> {
+        self.forward_through(x, grad, |hidden| hidden)
+    }
+
+    /// [`Mlp::forward`] with [`dropout`] at `rate` in each hidden layer, before its normalisation; without normalisation, after
+    /// its activation.
+    pub fn forward_with_dropout<T: Tape<f32, Cpu>>(
+        &self,
+        x: Tensor3<T>,
+        grad: Grad,
+        rate: f32,
+        rng: &mut Rng,
+    ) -> Tensor3<T> {
+        self.forward_through(x, grad, |hidden| dropout(hidden, rate, rng))
+    }
+
+    /// [`Mlp::forward`], with what each hidden layer hands to its normalisation going through `hidden`.
+    fn forward_through<T: Tape<f32, Cpu>>(
+        &self,
+        x: Tensor3<T>,
+        grad: Grad,
+        mut hidden: impl FnMut(Tensor3<T>) -> Tensor3<T>,
+    ) -> Tensor3<T> {
+        let last = self.layers.len() - 1;
         self.layers.iter().enumerate().fold(x, |x, (i, Layer { weight, bias, norm, activation })| {
             // Only the first layer stops gradients on its way to the input; to the others they must come through it.
             let of_norm = if grad == Grad::Input { Grad::Input } else { Grad::Both };
             let of_dense = if i == 0 { grad } else { of_norm };
-            let affine = |x, activation| ops::dense(x, weight, bias, activation, of_dense);
+            let affine = |activation| {
+                let y = ops::dense(x, weight, bias, activation, of_dense);
+                if i == last { y } else { hidden(y) }
+            };
             match norm {
-                NormParameters::None => affine(x, *activation),
+                NormParameters::None => affine(*activation),
                 NormParameters::Layer { gain, shift } => {
-                    norm::layer_norm(affine(x, Activation::Identity), gain, shift, *activation, of_norm)
+                    norm::layer_norm(affine(Activation::Identity), gain, shift, *activation, of_norm)
                 }
                 NormParameters::Rms { gain } => {
-                    norm::rms_norm(affine(x, Activation::Identity), gain, *activation, of_norm)
+                    norm::rms_norm(affine(Activation::Identity), gain, *activation, of_norm)
                 }
             }
         })

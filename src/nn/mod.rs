@@ -36,6 +36,7 @@
 
 mod adam;
 pub mod categorical;
+mod dropout;
 pub(crate) mod frozen;
 mod gaussian;
 pub mod kernels;
@@ -56,6 +57,7 @@ pub(crate) use adam::adam_step;
 pub use adam::{Adam, AdamConfig};
 pub use categorical::Categorical;
 pub use dfdx;
+pub use dropout::dropout;
 pub use gaussian::{BoundedNormal, SquashedGaussian};
 pub use kernels::Activation;
 pub use layers::{Init, Mlp, MlpConfig, Norm};
