@@ -208,6 +208,13 @@ pub trait Diagnostics {
     }
 }
 
+/// A discount factor for episodes of this many decisions (Hansen et al. 2024, TD-MPC2): (f - 1) / f for a fifth f of them,
+/// between 0.95 and 0.995.
+pub fn discount_for(decisions: f32) -> f32 {
+    let fifth = decisions / 5.0;
+    ((fifth - 1.0) / fifth).clamp(0.95, 0.995)
+}
+
 /// An agent that a run can train, save and diagnose.
 pub trait Learner: Agent + Checkpoint + Diagnostics {}
 

@@ -61,6 +61,25 @@ pub struct Batch {
     pub steps: Vec<usize>,
 }
 
+impl Batch {
+    /// Adds successive time steps of an episode as one transition with their n-step return.
+    pub(crate) fn push(&mut self, path: &[Row], gamma: f32) {
+        let (first, last) = (path[0], path[path.len() - 1]);
+        self.size += 1;
+        self.obs.extend(first.obs);
+        self.actions.extend(first.action);
+        let (mut reward, mut weight) = (0.0, 1.0);
+        for row in path {
+            reward += weight * row.reward;
+            weight *= gamma;
+        }
+        self.rewards.push(reward);
+        self.next_obs.extend(last.next_obs);
+        self.terminated.push(f32::from(last.terminated));
+        self.steps.push(path.len());
+    }
+}
+
 /// A ring buffer of the latest transitions.
 #[doc(alias = "replay buffer")]
 #[doc(alias = "experience replay")]
@@ -156,36 +175,26 @@ impl ReplayBuffer {
     #[doc(alias = "multi-step return")]
     pub fn sample_n_step(&self, size: usize, n: usize, gamma: f32, rng: &mut Rng) -> Batch {
         assert!(!self.is_empty(), "something to draw from");
-        let mut batch = Batch { size, ..Batch::default() };
+        let mut batch = Batch::default();
         for _ in 0..size {
             let first = rng.random_range(0..self.len());
-            let mut row = self.row(first);
-            batch.obs.extend(row.obs);
-            batch.actions.extend(row.action);
-            let (mut reward, mut weight, mut steps, mut index) = (row.reward, gamma, 1, first);
-            while steps < n
-                && let Some(next) = self.successor(index)
-            {
-                row = self.row(next);
-                reward += weight * row.reward;
-                weight *= gamma;
-                steps += 1;
-                index = next;
-            }
-            batch.rewards.push(reward);
-            batch.next_obs.extend(row.next_obs);
-            batch.terminated.push(f32::from(row.terminated));
-            batch.steps.push(steps);
+            batch.push(&self.episode_from(first).take(n).collect::<Vec<_>>(), gamma);
         }
         batch
+    }
+
+    /// The transition at index `i` and those that follow it in its episode, as far as the buffer holds them.
+    pub fn episode_from(&self, i: usize) -> impl Iterator<Item = Row<'_>> {
+        std::iter::successors(Some(i), |i| self.successor(*i)).map(|i| self.row(i))
     }
 
     /// The index of the transition after the one at index `i`, if it belongs to the same episode: if it starts from the
     /// observation at which the other ended.
     fn successor(&self, i: usize) -> Option<usize> {
         let next = (i + 1) % self.capacity;
-        let held = next < self.len() && self.serial(next) == self.serial(i) + 1;
-        (held && !self.row(i).terminated && self.row(next).obs == self.row(i).next_obs).then_some(next)
+        // After the newest comes the oldest, or nothing.
+        let newest = next == self.next();
+        (!newest && !self.row(i).terminated && self.row(next).obs == self.row(i).next_obs).then_some(next)
     }
 
     /// How many transitions may have been added, from those held.

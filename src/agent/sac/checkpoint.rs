@@ -18,7 +18,7 @@ impl Diagnostics for Sac {
             let actions = tensor(&self.cpu, actions, (1, episode.observations.len(), self.action_size));
             let q = self.critics.forward(ops::join(self.observations(&observations), actions), Grad::Input);
             let values = q.min::<(usize, usize), Axis<0>>().as_vec();
-            ValueEstimate::of_episode(&values, episode, self.config.discount)
+            ValueEstimate::of_episode(&values, episode, self.discount)
         };
         episodes.iter().flat_map(of_episode).collect()
     }

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::agent::discount_for;
 use crate::settings::{fits, ranges, weights_between};
 
 /// Settings of [`Sac`](super::Sac). [`Preset`](crate::agent::Preset) has tuned ones.
@@ -12,6 +13,10 @@ pub struct SacConfig {
     pub hidden: Vec<usize>,
     /// Whether the critics' hidden layers have layer normalisation, which makes several updates for each time step stable.
     pub layer_norm: bool,
+    /// Probability with which each number of the critics' hidden layers is dropped in an update: DroQ (Hiraoka et al. 2022),
+    /// which takes 0.0001 to 0.1 for 20 updates per time step.
+    #[doc(alias = "DroQ")]
+    pub critic_dropout: f32,
     /// Critics. The smallest of their values is used: with two, clipped double Q-learning (Fujimoto et al. 2018).
     #[doc(alias = "clipped double Q")]
     #[doc(alias = "twin critics")]
@@ -30,6 +35,8 @@ pub struct SacConfig {
     /// Discount factor gamma, per time step.
     #[doc(alias = "gamma")]
     pub discount: f32,
+    /// Whether the discount factor follows from the length of an episode instead: [`SacConfig::discount_for`].
+    pub discount_from_horizon: bool,
     /// Polyak averaging rate of the target critics (the target network), per critic update.
     #[doc(alias = "tau")]
     #[doc(alias = "target network")]
@@ -51,6 +58,11 @@ pub struct SacConfig {
     /// Time steps of reward in a target: n-step returns. The entropy of the steps between is left out.
     #[doc(alias = "multi-step return")]
     pub n_step: usize,
+    /// Share of a minibatch whose goals are replaced by what the same episode achieved later: hindsight experience replay
+    /// (Andrychowicz et al. 2017, who take 0.8). The environment needs a goal, and the agent the reward as a function of
+    /// observations: [`Sac::with_reward`](super::Sac::with_reward).
+    #[doc(alias = "HER")]
+    pub hindsight: f32,
     /// Critic updates for each time step: the update-to-data ratio.
     #[doc(alias = "UTD")]
     pub updates_per_step: usize,
@@ -65,6 +77,7 @@ impl Default for SacConfig {
         Self {
             hidden: vec![256, 256],
             layer_norm: false,
+            critic_dropout: 0.0,
             critics: 2,
             learning_rate: 3e-4,
             temperature_rate: 3e-4,
@@ -72,6 +85,7 @@ impl Default for SacConfig {
             target_entropy: -1.0,
             batch: 256,
             discount: 0.99,
+            discount_from_horizon: false,
             polyak: 0.005,
             replay: 1_000_000,
             warm_up: 1000,
@@ -79,6 +93,7 @@ impl Default for SacConfig {
             exploration_noise_beta: None,
             latent_features: false,
             n_step: 1,
+            hindsight: 0.0,
             updates_per_step: 1,
             critic_updates_per_policy_update: 1,
             max_gradient_norm: None,
@@ -86,9 +101,17 @@ impl Default for SacConfig {
     }
 }
 
+impl SacConfig {
+    /// The discount for episodes of `steps` time steps: [`discount_for`], TD-MPC2's rule, or the setting.
+    pub fn discount_for(&self, steps: usize) -> f32 {
+        if self.discount_from_horizon { discount_for(steps as f32) } else { self.discount }
+    }
+}
+
 ranges!(SacConfig {
     hidden: 1..=4096,
     layer_norm: Any,
+    critic_dropout: 0.0..=0.9,
     critics: 1..=32,
     learning_rate: 0.0..=1.0,
     temperature_rate: 0.0..=1.0,
@@ -96,6 +119,7 @@ ranges!(SacConfig {
     target_entropy: -100.0..=100.0,
     batch: 1..=65_536,
     discount: 0.0..=1.0,
+    discount_from_horizon: Any,
     polyak: 0.0..=1.0,
     replay: 1..=100_000_000,
     warm_up: 0..=1_000_000_000,
@@ -103,6 +127,7 @@ ranges!(SacConfig {
     exploration_noise_beta: 0.0..=10.0,
     latent_features: Any,
     n_step: 1..=1000,
+    hindsight: 0.0..=1.0,
     updates_per_step: 1..=1000,
     critic_updates_per_policy_update: 1..=1_000_000,
     max_gradient_norm: 1e-6..=1e9,
@@ -110,3 +135,25 @@ ranges!(SacConfig {
 require fits(&[*critics, weights_between(hidden)]) => "`critics` with the layers of `hidden` have too many weights";
 require fits(&[*critics, *batch, hidden.iter().sum()]) => "`critics` times `batch` times `hidden` does not fit into memory";
 );
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_discount_is_a_setting_or_follows_from_the_length_of_an_episode() {
+        let set = SacConfig { discount: 0.9, ..SacConfig::default() };
+        assert_eq!(set.discount_for(150), 0.9);
+        let by_length = SacConfig { discount_from_horizon: true, ..set };
+        assert!((by_length.discount_for(150) - 29.0 / 30.0).abs() < 1e-6);
+        assert_eq!(by_length.discount_for(100), 0.95);
+    }
+
+    /// Settings of runs from before the later ones were added mean what they meant.
+    #[test]
+    fn old_settings_load() {
+        let old: SacConfig = toml::from_str("layer_norm = true\ndiscount = 0.95\nwarm_up = 500").expect("old settings");
+        assert_eq!(old, SacConfig { layer_norm: true, discount: 0.95, warm_up: 500, ..SacConfig::default() });
+        assert_eq!((old.n_step, old.hindsight, old.critic_dropout, old.latent_features), (1, 0.0, 0.0, false));
+    }
+}

@@ -10,21 +10,28 @@
 //! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; truncated episodes
 //! are bootstrapped; returns may be of n steps; the policy may explore with coloured noise.
 
+mod backup;
 mod checkpoint;
 mod config;
+mod hindsight;
+mod inputs;
 mod temperature;
+
+use std::sync::Arc;
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
+use backup::soft_bellman_backup;
 pub use config::SacConfig;
+use hindsight::Hindsight;
+use inputs::Inputs;
 use temperature::Temperature;
 
 use super::warm_up::RandomActions;
 use super::{Agent, Losses, Mode, Slot};
-use crate::env::Spec;
+use crate::env::{KnownReward, Spec};
 use crate::error::Result;
-use crate::model::features::LatentFeatures;
 use crate::nn::ops;
 use crate::nn::{
     Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, copy_parameters, device,
@@ -33,9 +40,6 @@ use crate::nn::{
 use crate::replay::{Batch, ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
 use crate::settings::Ranges;
-
-/// Scaled observations are clamped to this.
-const MAX_INPUT: f32 = 10.0;
 
 /// The SAC agent: a policy, its critics and target critics, a temperature, and a replay buffer.
 ///
@@ -64,11 +68,8 @@ const MAX_INPUT: f32 = 10.0;
 pub struct Sac {
     config: SacConfig,
     cpu: Cpu,
-    /// What the networks read, if not each feature by itself.
-    features: Option<LatentFeatures>,
-    /// Centre and scale of each feature of an observation.
-    centre: Vec<f32>,
-    scale: Vec<f32>,
+    inputs: Inputs,
+    discount: f32,
     action_size: usize,
     /// From observations to mean and log standard deviation of a squashed Gaussian.
     policy: Mlp,
@@ -80,6 +81,7 @@ pub struct Sac {
     critic_optimiser: Adam,
     temperature: Temperature,
     replay: ReplayBuffer,
+    hindsight: Option<Hindsight>,
     observed: usize,
     updates: usize,
     /// Coloured noise of the warm-up, and of the policy after it.
@@ -94,17 +96,32 @@ impl Sac {
     /// # Errors
     /// If a setting or the spec cannot be used.
     pub fn new(spec: &Spec, config: SacConfig, seed: u64) -> Result<Self> {
+        Self::with_reward(spec, None, config, seed)
+    }
+
+    /// A new agent that is given the reward as a function of observations, for [`SacConfig::hindsight`]; it makes no other use
+    /// of it.
+    ///
+    /// # Errors
+    /// As [`Sac::new`], or if the settings ask for hindsight where there is no goal or the reward is not known.
+    pub fn with_reward(
+        spec: &Spec,
+        reward: Option<Arc<dyn KnownReward + Send + Sync>>,
+        config: SacConfig,
+        seed: u64,
+    ) -> Result<Self> {
         config.check_at("sac")?;
         spec.check()?;
+        let share = config.hindsight;
+        let hindsight = (share > 0.0).then(|| Hindsight::new(spec, reward, share)).transpose()?;
         let cpu = device();
         let mut rng = rng::stream(seed, "sac");
         let (observation_size, action_size) = (spec.observation_size(), spec.action_size);
-        let features = config.latent_features.then(|| LatentFeatures::new(spec));
-        let input = features.as_ref().map_or(observation_size, LatentFeatures::width);
+        let inputs = Inputs::new(spec, config.latent_features);
         let noise = |beta: Option<f64>| beta.map(|beta| RandomActions::new(beta, spec.horizon, action_size));
         let policy = MlpConfig {
             members: 1,
-            input,
+            input: inputs.width(),
             hidden: config.hidden.clone(),
             output: Some(2 * action_size),
             norm: Norm::None,
@@ -113,7 +130,7 @@ impl Sac {
         };
         let critics = MlpConfig {
             members: config.critics,
-            input: input + action_size,
+            input: inputs.width() + action_size,
             output: Some(1),
             norm: if config.layer_norm { Norm::Layer } else { Norm::None },
             ..policy.clone()
@@ -126,9 +143,8 @@ impl Sac {
         let optimiser =
             Adam::new(AdamConfig { max_norm: config.max_gradient_norm, ..AdamConfig::new(config.learning_rate) });
         Ok(Self {
-            features,
-            centre: spec.observation.iter().map(|feature| feature.centre).collect(),
-            scale: spec.observation.iter().map(|feature| feature.scale).collect(),
+            inputs,
+            discount: config.discount_for(spec.horizon),
             action_size,
             policy,
             critics,
@@ -137,6 +153,7 @@ impl Sac {
             critic_optimiser: optimiser,
             temperature: Temperature::new(config.initial_temperature, config.temperature_rate),
             replay: ReplayBuffer::new(observation_size, action_size, config.replay),
+            hindsight,
             observed: 0,
             updates: 0,
             warm_up_noise: noise(config.warm_up_noise_beta),
@@ -158,8 +175,11 @@ impl Sac {
     /// actions, in nats) and `temperature`; `critic_gradient` and `policy_gradient` are norms before clipping.
     #[doc(alias = "Bellman")]
     pub fn learn(&mut self) -> Losses {
-        let SacConfig { batch, n_step, discount, .. } = self.config;
-        let batch = self.replay.sample_n_step(batch, n_step, discount, &mut self.rng);
+        let SacConfig { batch, n_step, .. } = self.config;
+        let batch = match &self.hindsight {
+            None => self.replay.sample_n_step(batch, n_step, self.discount, &mut self.rng),
+            Some(hindsight) => hindsight.sample(&self.replay, batch, n_step, self.discount, &mut self.rng),
+        };
         let mut losses = self.update_critics(&batch);
         self.updates += 1;
         if self.updates.is_multiple_of(self.config.critic_updates_per_policy_update) {
@@ -175,9 +195,10 @@ impl Sac {
         let next_obs = self.observations(&batch.next_obs);
         let head = self.policy.forward(next_obs.clone(), Grad::Input);
         let (next_action, next_log_pi) = SquashedGaussian::from_head(head).sample(self.noise(batch.size));
-        let q = self.target_critics.forward(ops::join(next_obs, next_action), Grad::Input);
+        let input = ops::join(next_obs, next_action);
+        let q = self.target_critics.forward_with_dropout(input, Grad::Input, self.config.critic_dropout, &mut self.rng);
         let min_q = q.min::<(usize, usize), Axis<0>>().as_vec();
-        soft_bellman_backup(batch, &min_q, &next_log_pi.as_vec(), self.temperature(), self.config.discount)
+        soft_bellman_backup(batch, &min_q, &next_log_pi.as_vec(), self.temperature(), self.discount)
     }
 
     /// A step on the soft Bellman residual (equation 5), J_Q = E[(Q(s, a) - y)^2], summed over the critics (without the
@@ -188,7 +209,8 @@ impl Sac {
         let y = tensor(&self.cpu, y, (critics, batch.size, 1));
         let actions = tensor(&self.cpu, batch.actions.clone(), (1, batch.size, self.action_size));
         let input = ops::join(self.observations(&batch.obs), actions);
-        let q = self.critics.forward(input.leaky_traced(), Grad::Params);
+        let dropout = self.config.critic_dropout;
+        let q = self.critics.forward_with_dropout(input.leaky_traced(), Grad::Params, dropout, &mut self.rng);
         let mean_q = values(&q).iter().sum::<f32>() / (critics * batch.size) as f32;
         let loss = (q - y).square().mean() * critics as f32;
         let critic_loss = loss.array();
@@ -208,7 +230,8 @@ impl Sac {
         let log_pis = log_pi.as_vec();
         // Gradients flow through the critics to the action, but not into the critics.
         let (action, tape) = action.split_tape();
-        let q = self.critics.forward(ops::join(obs.put_tape(tape), action), Grad::Input);
+        let input = ops::join(obs.put_tape(tape), action);
+        let q = self.critics.forward_with_dropout(input, Grad::Input, self.config.critic_dropout, &mut self.rng);
         let min_q = q.min::<(usize, usize), Axis<0>>().mean();
         let loss = log_pi.mean() * self.temperature() - min_q;
         let policy_loss = loss.array();
@@ -233,20 +256,9 @@ impl Sac {
         values(&actions).chunks(self.action_size).map(<[f32]>::to_vec).collect()
     }
 
-    /// Observations as the networks' input, scaled: `[1, rows, features]`.
+    /// Observations as the networks read them: `[1, rows, inputs]`.
     fn observations(&self, raw: &[f32]) -> Tensor3 {
-        if let Some(features) = &self.features {
-            return features.encode(&self.cpu, raw);
-        }
-        let size = self.centre.len();
-        let features = || self.centre.iter().zip(&self.scale);
-        let mut scaled = Vec::with_capacity(raw.len());
-        for row in raw.chunks_exact(size) {
-            // A cube that fell off the table is far away; the networks need not know how far.
-            let row = row.iter().zip(features());
-            scaled.extend(row.map(|(x, (centre, scale))| ((x - centre) / scale).clamp(-MAX_INPUT, MAX_INPUT)));
-        }
-        tensor(&self.cpu, scaled, (1, raw.len() / size, size))
+        self.inputs.of(&self.cpu, raw)
     }
 
     /// Standard normal noise, `[1, rows, actions]`.
@@ -302,21 +314,6 @@ impl Agent for Sac {
     }
 }
 
-/// The soft Bellman backup (equations 2 and 3), `[batch]`:
-///
-/// ```text
-/// y = r + gamma^n (1 - terminated) (min Q(s', a') - alpha log pi(a'|s'))
-/// ```
-///
-/// `q` is min Q(s', a') and `log_pi` is log pi(a'|s'), n time steps later; r is the sum of n rewards. A truncated episode is bootstrapped, a terminated one is not.
-#[doc(alias = "Bellman")]
-fn soft_bellman_backup(batch: &Batch, q: &[f32], log_pi: &[f32], temperature: f32, discount: f32) -> Vec<f32> {
-    let soft_values = q.iter().zip(log_pi).map(|(q, log_pi)| q - temperature * log_pi);
-    let discounts = batch.steps.iter().map(|&n| discount.powi(n as i32));
-    let targets = batch.rewards.iter().zip(&batch.terminated).zip(discounts).zip(soft_values);
-    targets.map(|(((reward, terminated), discount), value)| reward + discount * (1.0 - terminated) * value).collect()
-}
-
 impl std::fmt::Debug for Sac {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
         f.debug_struct("Sac")
@@ -329,15 +326,4 @@ impl std::fmt::Debug for Sac {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn targets_bootstrap_unless_the_task_ended() {
-        let (rewards, terminated) = (vec![1.0, -0.5, 1.0], vec![0.0, 1.0, 0.0]);
-        let batch = Batch { size: 3, rewards, terminated, steps: vec![1, 1, 2], ..Batch::default() };
-        let y = soft_bellman_backup(&batch, &[4.5, 2.0, 4.5], &[-0.8, 1.2, -0.8], 0.2, 0.99);
-        assert!((y[0] - 5.6134).abs() < 1e-6 && (y[1] + 0.5).abs() < 1e-6, "{y:?}");
-        assert!((y[2] - 5.567_266).abs() < 1e-5, "two steps: {y:?}");
-    }
-}
+mod tests;

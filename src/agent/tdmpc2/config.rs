@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::agent::discount_for;
 use crate::model::ImplicitConfig;
 use crate::plan::GuidedConfig;
 use crate::settings::{fits, ranges};
@@ -73,11 +74,10 @@ impl Default for TdMpc2Config {
 }
 
 impl TdMpc2Config {
-    /// The discount for episodes of `steps` time steps: the setting, or else the published rule, (f - 1) / f for a fifth f of
-    /// their decisions, between 0.95 and 0.995.
+    /// The discount for episodes of `steps` time steps: the setting, or else the published rule, [`discount_for`] their
+    /// decisions.
     pub fn discount_for(&self, steps: usize) -> f32 {
-        let fifth = steps as f32 / self.action_repeat as f32 / 5.0;
-        self.discount.unwrap_or_else(|| ((fifth - 1.0) / fifth).clamp(0.95, 0.995))
+        self.discount.unwrap_or_else(|| discount_for(steps as f32 / self.action_repeat as f32))
     }
 }
 

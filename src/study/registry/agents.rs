@@ -97,7 +97,7 @@ pub(super) fn register(registry: Registry) -> Registry {
     let oracle =
         AgentEntry::new("oracle", false, |context, config| context.oracle(config)).with_ranges::<OracleConfig>();
     let sac = AgentEntry::new("sac", true, |context, config: SacConfig| {
-        Ok(Method::learner(Sac::new(context.spec, config, context.seed)?))
+        Ok(Method::learner(Sac::with_reward(context.spec, context.known_reward()?, config, context.seed)?))
     });
     let dreamer = AgentEntry::new("dreamer", true, |context, config: DreamerConfig| {
         Ok(Method::learner(Dreamer::new(context.spec, config, context.seed)?))

@@ -1,0 +1,147 @@
+//! Hindsight experience replay (HER; Andrychowicz et al. 2017): whatever an episode came to is treated as if it had been its
+//! goal, so that there is success to learn from before the first goal is reached.
+//!
+//! A goal is a feature that is constant over an episode and compared with a dynamic one by a
+//! [`Role::Difference`]; the dynamic one is what was achieved. The new goal is what a later time step of the same episode achieved
+//! (the paper's strategy *future*), the difference is computed anew, and so is the reward, which therefore has to be known.
+
+use std::sync::Arc;
+
+use rand::RngExt;
+
+use crate::env::{KnownReward, Role, Spec};
+use crate::error::{Error, Result};
+use crate::model::FeatureMap;
+use crate::replay::{Batch, ReplayBuffer, Row};
+use crate::rng::Rng;
+
+/// Draws minibatches part of which are relabelled.
+pub(super) struct Hindsight {
+    /// The part that is relabelled.
+    share: f32,
+    /// Indices of each goal's feature and of what is compared with it: `[goal, achieved]`.
+    goals: Vec<[usize; 2]>,
+    /// `[index, minuend, subtrahend]`.
+    differences: Vec<[usize; 3]>,
+    reward: Arc<dyn KnownReward + Send + Sync>,
+}
+
+impl Hindsight {
+    pub(super) fn new(spec: &Spec, reward: Option<Arc<dyn KnownReward + Send + Sync>>, share: f32) -> Result<Self> {
+        let refused = |what: &str| Error::Config(format!("`sac.hindsight` is {share}, but {} {what}", spec.name));
+        let reward = reward.filter(|reward| reward.is_known());
+        let reward = reward.ok_or_else(|| refused("has no reward that is known as a function of observations"))?;
+        let constant = |i: usize| spec.observation[i].role == Role::Constant;
+        let mut differences = FeatureMap::new(spec)?.differences;
+        differences.retain(|&[_, a, b]| constant(a) != constant(b));
+        let goals: Vec<_> = differences.iter().map(|&[_, a, b]| if constant(a) { [a, b] } else { [b, a] }).collect();
+        if goals.is_empty() {
+            return Err(refused("has no goal: no constant feature that another one is compared with"));
+        }
+        Ok(Self { share, goals, differences, reward })
+    }
+
+    /// As [`ReplayBuffer::sample_n_step`].
+    pub(super) fn sample(&self, replay: &ReplayBuffer, size: usize, n: usize, gamma: f32, rng: &mut Rng) -> Batch {
+        let mut batch = Batch::default();
+        for _ in 0..size {
+            let rows: Vec<Row> = replay.episode_from(rng.random_range(0..replay.len())).collect();
+            let path = &rows[..n.min(rows.len())];
+            if rng.random::<f32>() >= self.share {
+                batch.push(path, gamma);
+                continue;
+            }
+            let achieved = rows[rng.random_range(0..rows.len())].next_obs;
+            let relabelled: Vec<[Vec<f32>; 2]> =
+                path.iter().map(|row| [row.obs, row.next_obs].map(|obs| self.relabel(obs, achieved))).collect();
+            let path = path.iter().zip(&relabelled).map(|(row, [obs, next_obs])| {
+                let reward = self.reward.reward(obs, row.action, next_obs);
+                Row { obs, next_obs, reward, ..*row }
+            });
+            batch.push(&path.collect::<Vec<_>>(), gamma);
+        }
+        batch
+    }
+
+    /// `obs`, if the goal had been what is `achieved` in another observation.
+    fn relabel(&self, obs: &[f32], achieved: &[f32]) -> Vec<f32> {
+        let mut obs = obs.to_vec();
+        self.goals.iter().for_each(|&[goal, of]| obs[goal] = achieved[of]);
+        self.differences.iter().for_each(|&[i, a, b]| obs[i] = obs[a] - obs[b]);
+        obs
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::env::{Env, Feature, Task};
+    use crate::replay::Transition;
+    use crate::rng;
+
+    /// One where the goal is reached.
+    struct There;
+
+    impl KnownReward for There {
+        fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
+            f32::from(next_obs[2] == 0.0)
+        }
+    }
+
+    fn line() -> Spec {
+        let way = Feature::new("way").difference("goal", "x");
+        Spec::new("line", [Feature::new("x"), Feature::new("goal").constant(), way], 1, 4, 0.1)
+    }
+
+    /// Two episodes go from 0 to 4, one for the goal 100, the other for 200. In hindsight they were after 1, 2, 3 or 4, and
+    /// nothing later than the goal, nor of the other episode, is in sight.
+    #[test]
+    fn goals_are_achieved_later_in_the_same_episode() {
+        let mut replay = ReplayBuffer::new(3, 1, 100);
+        for goal in [100.0, 200.0] {
+            let at = |x: usize| vec![x as f32, goal, goal - x as f32];
+            for x in 0..4 {
+                let (obs, next_obs) = (at(x), at(x + 1));
+                let (terminated, truncated) = (false, x == 3);
+                replay.push(&Transition { obs, action: vec![0.0], reward: 0.0, next_obs, terminated, truncated });
+            }
+        }
+        let hindsight = Hindsight::new(&line(), Some(Arc::new(There)), 0.75).expect("a goal and a reward");
+        let batch = hindsight.sample(&replay, 4000, 2, 0.5, &mut rng::stream(0, "hindsight"));
+        assert_eq!(batch.size, 4000);
+        let mut relabelled = 0;
+        for i in 0..batch.size {
+            let ([x, goal, way], [next, next_goal, next_way]) = [&batch.obs, &batch.next_obs]
+                .map(|rows| <[f32; 3]>::try_from(&rows[3 * i..][..3]).expect("three"))
+                .into();
+            assert!(
+                goal == next_goal && way == goal - x && next_way == goal - next,
+                "the same goal, and the way to it"
+            );
+            if goal < 100.0 {
+                relabelled += 1;
+                assert!(goal > x && goal <= 4.0, "{goal} is achieved after {x}");
+            }
+            let rewards = f32::from(x + 1.0 == goal) + 0.5 * f32::from(x < 3.0 && x + 2.0 == goal);
+            assert_eq!((batch.rewards[i], batch.steps[i]), (rewards, if x < 3.0 { 2 } else { 1 }));
+        }
+        assert!((relabelled as f32 / 4000.0 - 0.75).abs() < 0.035, "{relabelled}");
+    }
+
+    /// On the arm's tasks a transition whose goal was relabelled has the reward that the environment would have given.
+    #[test]
+    fn tasks_with_goals_can_be_relabelled() {
+        for task in [Task::Reach, Task::Push] {
+            let mut world = task.make();
+            let obs = world.reset(1);
+            let hindsight = Hindsight::new(world.spec(), Some(Arc::new(task.make())), 0.8).expect("a goal");
+            let reached = hindsight.relabel(&obs, &obs);
+            assert_eq!(world.reward(&obs, &[0.0; 4], &reached), 1.0, "{}: the goal is where it is", task.name());
+        }
+        let lift = Task::Lift.make();
+        let problem = Hindsight::new(lift.spec(), Some(Arc::new(Task::Lift.make())), 0.8).err().expect("no goal");
+        assert!(problem.to_string().contains("has no goal"), "{problem}");
+        let problem = Hindsight::new(&line(), None, 0.8).err().expect("no reward").to_string();
+        assert!(problem.contains("`sac.hindsight` is 0.8, but line has no reward"), "{problem}");
+    }
+}
