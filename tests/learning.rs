@@ -343,6 +343,24 @@ fn a_resumed_run_ends_as_if_it_had_never_stopped() {
 }
 
 #[test]
+fn a_resumed_run_with_all_that_sac_can_do_ends_as_if_it_had_never_stopped() {
+    let config = debug_run(1);
+    let sac = SacConfig {
+        latent_features: true,
+        layer_norm: true,
+        critic_dropout: 0.01,
+        n_step: 3,
+        hindsight: 0.8,
+        warm_up_noise_beta: Some(1.0),
+        exploration_noise_beta: Some(1.0),
+        discount_from_horizon: true,
+        ..config.settings().expect("SAC's settings")
+    };
+    let files = ["episodes.csv", "evaluations.csv", "losses.csv", "test.csv"];
+    ends_as_if_it_had_never_stopped(&config.with_settings(&sac), &files);
+}
+
+#[test]
 fn so_does_one_that_plans() {
     let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "test.csv"];
     ends_as_if_it_had_never_stopped(&small_pets(1), &files);
@@ -449,6 +467,27 @@ fn a_trained_agent_comes_back_from_its_folder() {
     let tested = std::fs::read_to_string(folder.path().join("summary.toml")).expect("a summary");
     let tested: toml::Table = toml::from_str(&tested).expect("TOML");
     assert_eq!(tested["return_mean"].as_float(), Some(again.summary().return_mean));
+}
+
+/// A run is resumed by a later edition, whose settings have grown: what is new has its default.
+#[test]
+fn a_run_from_before_a_setting_existed_is_resumed() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = debug_run(3);
+    let mut old = config.clone();
+    old.settings.remove("n_step").expect("a setting");
+    let mut run = open(&old, folder.path()).expect("a new run");
+    while !matches!(run.step().expect("a healthy run"), Event::Evaluated(_)) {}
+    run.save().expect("a writable folder");
+    let step = run.steps_done();
+    drop(run);
+    let mut run = open(&config, folder.path()).expect("the same run");
+    assert_eq!(run.steps_done(), step);
+    finish(&mut run);
+    drop(run);
+    let longer = config.settings().map(|sac| SacConfig { n_step: 2, ..sac }).expect("SAC's settings");
+    let Err(problem) = open(&config.with_settings(&longer), folder.path()) else { panic!("another run") };
+    assert!(problem.to_string().contains("`sac.n_step` is nothing, not 2"), "{problem}");
 }
 
 #[test]

@@ -233,7 +233,17 @@ impl Registry {
     /// # Errors
     /// As [`Run::open`].
     pub fn open_run(&self, config: &RunConfig, folder: &Path) -> Result<Run<Box<dyn Env>>> {
-        Run::open(config.clone(), self.method(config)?, || self.make_env(config), folder)
+        Run::open(self.as_begun(config, folder), self.method(config)?, || self.make_env(config), folder)
+    }
+
+    /// The configuration as the run in `folder` was begun with it: without the settings that did not exist at the time, if it has
+    /// their defaults now.
+    fn as_begun(&self, config: &RunConfig, folder: &Path) -> RunConfig {
+        let same = |begun: &RunConfig| {
+            let mut begun = begun.clone();
+            matches!(self.complete(&mut begun), Ok(Ok(()))) && begun == *config
+        };
+        read_config(folder).ok().map(|(_, begun)| begun).filter(same).unwrap_or_else(|| config.clone())
     }
 
     /// The method of the run in `folder`, with what it has learned.
