@@ -41,20 +41,17 @@ impl Hindsight {
         Ok(Self { share, goals, differences, reward })
     }
 
-    /// As [`ReplayBuffer::sample_n_step`].
+    /// As [`ReplayBuffer::sample_n_step`], with the rewards of the known function.
     pub(super) fn sample(&self, replay: &ReplayBuffer, size: usize, n: usize, gamma: f32, rng: &mut Rng) -> Batch {
         let mut batch = Batch::default();
         for _ in 0..size {
             let rows: Vec<Row> = replay.episode_from(rng.random_range(0..replay.len())).collect();
+            let relabelled = rng.random::<f32>() < self.share;
+            let achieved = relabelled.then(|| rows[rng.random_range(0..rows.len())].next_obs);
+            let seen = |obs: &[f32]| achieved.map_or_else(|| obs.to_vec(), |achieved| self.relabel(obs, achieved));
             let path = &rows[..n.min(rows.len())];
-            if rng.random::<f32>() >= self.share {
-                batch.push(path, gamma);
-                continue;
-            }
-            let achieved = rows[rng.random_range(0..rows.len())].next_obs;
-            let relabelled: Vec<[Vec<f32>; 2]> =
-                path.iter().map(|row| [row.obs, row.next_obs].map(|obs| self.relabel(obs, achieved))).collect();
-            let path = path.iter().zip(&relabelled).map(|(row, [obs, next_obs])| {
+            let observations: Vec<_> = path.iter().map(|row| (seen(row.obs), seen(row.next_obs))).collect();
+            let path = path.iter().zip(&observations).map(|(row, (obs, next_obs))| {
                 let reward = self.reward.reward(obs, row.action, next_obs);
                 Row { obs, next_obs, reward, ..*row }
             });

@@ -8,7 +8,8 @@
 //! Deviations: log standard deviations are squashed into [-5, 2] as in CleanRL; the temperature's loss is
 //! -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
 //! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; truncated episodes
-//! are bootstrapped; returns may be of n steps; the policy may explore with coloured noise.
+//! are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the mean of the critics for the policy
+//! where we take the smallest); goals may be relabelled in hindsight; the policy may explore with coloured noise.
 
 mod backup;
 mod checkpoint;
@@ -99,8 +100,8 @@ impl Sac {
         Self::with_reward(spec, None, config, seed)
     }
 
-    /// A new agent that is given the reward as a function of observations, for [`SacConfig::hindsight`]; it makes no other use
-    /// of it.
+    /// A new agent that is given the reward as a function of observations. With [`SacConfig::hindsight`] it learns from that
+    /// reward; without, it makes no use of it.
     ///
     /// # Errors
     /// As [`Sac::new`], or if the settings ask for hindsight where there is no goal or the reward is not known.
