@@ -349,6 +349,7 @@ fn a_resumed_run_with_all_that_sac_can_do_ends_as_if_it_had_never_stopped() {
         latent_features: true,
         layer_norm: true,
         critic_dropout: 0.01,
+        action_repeat: 2,
         n_step: 3,
         hindsight: 0.8,
         warm_up_noise_beta: Some(1.0),

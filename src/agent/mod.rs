@@ -25,6 +25,7 @@
 //! [`Oracle`] is a policy only, because it needs the environment itself.
 
 mod baselines;
+mod decision;
 pub mod dreamer;
 mod oracle;
 mod pets;

@@ -4,6 +4,7 @@ use dfdx::prelude::*;
 
 use super::Sac;
 use super::temperature::Temperature;
+use crate::agent::decision::in_decisions;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
@@ -13,6 +14,7 @@ use crate::replay::Episode;
 impl Diagnostics for Sac {
     fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
         let of_episode = |episode: &Episode| {
+            let episode = &in_decisions(episode, self.config.action_repeat);
             let observations = episode.observations.concat();
             let actions = self.modes(&observations).concat();
             let actions = tensor(&self.cpu, actions, (1, episode.observations.len(), self.action_size));
@@ -63,7 +65,9 @@ impl Checkpoint for Sac {
         self.policy_optimiser.load(state, "policy", &self.policy)?;
         self.critic_optimiser.load(state, "critics", &self.critics)?;
         self.replay.load(state, "replay")?;
-        let counts = state.counts_within("counts", &[self.replay.pushes(), 0..=MAX_COUNT])?;
+        let (held, most) = self.replay.pushes().into_inner();
+        let observed = held..=most.saturating_mul(self.config.action_repeat as u64).min(MAX_COUNT);
+        let counts = state.counts_within("counts", &[observed, 0..=MAX_COUNT])?;
         self.temperature.moments = [first, second];
         self.temperature.steps = steps.max(0.0) as i32;
         self.observed = counts[0] as usize;

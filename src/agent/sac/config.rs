@@ -30,9 +30,13 @@ pub struct SacConfig {
     pub initial_temperature: f32,
     /// Target entropy in nats, for each number of an action: -1 gives the usual -dim(A).
     pub target_entropy: f32,
+    /// Time steps for which each action is held: a decision. Transitions, the discount and n-step returns are of decisions; their
+    /// rewards are means.
+    #[doc(alias = "frame skip")]
+    pub action_repeat: usize,
     /// Transitions in a minibatch.
     pub batch: usize,
-    /// Discount factor gamma, per time step.
+    /// Discount factor gamma, per decision.
     #[doc(alias = "gamma")]
     pub discount: f32,
     /// Whether the discount factor follows from the length of an episode instead: [`SacConfig::discount_for`].
@@ -55,7 +59,7 @@ pub struct SacConfig {
     /// Whether the networks read what latent models read ([`LatentFeatures`](crate::model::features::LatentFeatures)): positions
     /// relative to the hand, small distances magnified, cubes in canonical orientation.
     pub latent_features: bool,
-    /// Time steps of reward in a target: n-step returns. The entropy of the steps between is left out.
+    /// Decisions whose rewards are in a target: n-step returns. The entropy of those between is left out.
     #[doc(alias = "multi-step return")]
     pub n_step: usize,
     /// Share of a minibatch whose goals are replaced by what the same episode achieved later: hindsight experience replay
@@ -83,6 +87,7 @@ impl Default for SacConfig {
             temperature_rate: 3e-4,
             initial_temperature: 1.0,
             target_entropy: -1.0,
+            action_repeat: 1,
             batch: 256,
             discount: 0.99,
             discount_from_horizon: false,
@@ -104,7 +109,7 @@ impl Default for SacConfig {
 impl SacConfig {
     /// The discount for episodes of `steps` time steps: [`discount_for`], TD-MPC2's rule, or the setting.
     pub fn discount_for(&self, steps: usize) -> f32 {
-        if self.discount_from_horizon { discount_for(steps as f32) } else { self.discount }
+        if self.discount_from_horizon { discount_for(steps as f32 / self.action_repeat as f32) } else { self.discount }
     }
 }
 
@@ -117,6 +122,7 @@ ranges!(SacConfig {
     temperature_rate: 0.0..=1.0,
     initial_temperature: 1e-6..=1e4,
     target_entropy: -100.0..=100.0,
+    action_repeat: 1..=1000,
     batch: 1..=65_536,
     discount: 0.0..=1.0,
     discount_from_horizon: Any,

@@ -11,6 +11,7 @@
 //! are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the mean of the critics for the policy
 //! where we take the smallest); goals may be relabelled in hindsight; the policy may explore with coloured noise.
 
+mod acting;
 mod backup;
 mod checkpoint;
 mod config;
@@ -29,8 +30,9 @@ use hindsight::Hindsight;
 use inputs::Inputs;
 use temperature::Temperature;
 
+use super::decision::{Decision, Held};
 use super::warm_up::RandomActions;
-use super::{Agent, Losses, Mode, Slot};
+use super::{Losses, Slots};
 use crate::env::{KnownReward, Spec};
 use crate::error::Result;
 use crate::nn::ops;
@@ -38,7 +40,7 @@ use crate::nn::{
     Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, copy_parameters, device,
     polyak, tensor, values,
 };
-use crate::replay::{Batch, ReplayBuffer, Transition};
+use crate::replay::{Batch, ReplayBuffer};
 use crate::rng::{self, Rng};
 use crate::settings::Ranges;
 
@@ -88,6 +90,11 @@ pub struct Sac {
     /// Coloured noise of the warm-up, and of the policy after it.
     warm_up_noise: Option<RandomActions>,
     exploration_noise: Option<RandomActions>,
+    /// The action that is held, and what it has brought so far.
+    held: Held,
+    decision: Decision,
+    /// The actions held in the environments that it is evaluated in.
+    slots: Slots<Held>,
     rng: Rng,
 }
 
@@ -119,7 +126,9 @@ impl Sac {
         let mut rng = rng::stream(seed, "sac");
         let (observation_size, action_size) = (spec.observation_size(), spec.action_size);
         let inputs = Inputs::new(spec, config.latent_features);
-        let noise = |beta: Option<f64>| beta.map(|beta| RandomActions::new(beta, spec.horizon, action_size));
+        let noise = |beta: Option<f64>| {
+            beta.map(|beta| RandomActions::new(beta, spec.horizon / config.action_repeat, action_size))
+        };
         let policy = MlpConfig {
             members: 1,
             input: inputs.width(),
@@ -159,6 +168,9 @@ impl Sac {
             updates: 0,
             warm_up_noise: noise(config.warm_up_noise_beta),
             exploration_noise: noise(config.exploration_noise_beta),
+            held: Held::default(),
+            decision: Decision::default(),
+            slots: Slots::default(),
             rng,
             cpu,
             config,
@@ -250,13 +262,6 @@ impl Sac {
         ])
     }
 
-    /// The deterministic action tanh(mean) for each row of observations.
-    fn modes(&self, observations: &[f32]) -> Vec<Vec<f32>> {
-        let head = self.policy.forward(self.observations(observations), Grad::Input);
-        let actions = SquashedGaussian::from_head(head).mode();
-        values(&actions).chunks(self.action_size).map(<[f32]>::to_vec).collect()
-    }
-
     /// Observations as the networks read them: `[1, rows, inputs]`.
     fn observations(&self, raw: &[f32]) -> Tensor3 {
         self.inputs.of(&self.cpu, raw)
@@ -266,52 +271,6 @@ impl Sac {
     fn noise(&mut self, rows: usize) -> Tensor3 {
         let noise = (0..rows * self.action_size).map(|_| rng::normal(&mut self.rng) as f32).collect();
         tensor(&self.cpu, noise, (1, rows, self.action_size))
-    }
-}
-
-impl Agent for Sac {
-    fn begin_episode(&mut self) {
-        [&mut self.warm_up_noise, &mut self.exploration_noise].into_iter().flatten().for_each(RandomActions::reset);
-    }
-
-    fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
-        if mode == Mode::Evaluate {
-            return self.modes(obs).remove(0);
-        }
-        if self.observed < self.config.warm_up {
-            if let Some(noise) = &mut self.warm_up_noise {
-                return noise.next(&mut self.rng);
-            }
-            return (0..self.action_size).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect();
-        }
-        let head = self.policy.forward(self.observations(obs), Grad::Input);
-        let noise = match &mut self.exploration_noise {
-            Some(noise) => tensor(&self.cpu, noise.deviates(&mut self.rng), (1, 1, self.action_size)),
-            None => self.noise(1),
-        };
-        let (action, _) = SquashedGaussian::from_head(head).sample(noise);
-        values(&action).to_vec()
-    }
-
-    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
-        self.modes(&observations.concat())
-    }
-
-    fn observe(&mut self, transition: &Transition) {
-        self.replay.push(transition);
-        self.observed += 1;
-        if transition.terminated || transition.truncated {
-            self.begin_episode();
-        }
-    }
-
-    fn update(&mut self) -> Option<Losses> {
-        if self.observed < self.config.warm_up {
-            return None;
-        }
-        // Inside the thread pool: a parallel section entered from outside hands its work over each time.
-        rayon::scope(|_| (0..self.config.updates_per_step).map(|_| self.learn()).last())
     }
 }
 

@@ -1,4 +1,5 @@
 use super::*;
+use crate::agent::{Agent, Mode};
 use crate::env::Feature;
 
 /// The correlation of an agent's successive actions at one observation, in 40 episodes of 50 steps.

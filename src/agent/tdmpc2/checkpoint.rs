@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::decision::in_decisions;
 use super::{Networks, Pilot, RunningScale, TdMpc2};
+use crate::agent::decision::in_decisions;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;

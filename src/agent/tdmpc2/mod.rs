@@ -17,7 +17,6 @@
 
 mod checkpoint;
 mod config;
-mod decision;
 mod planning;
 mod scale;
 mod update;
@@ -25,10 +24,10 @@ mod update;
 use rayon::prelude::*;
 
 pub use config::TdMpc2Config;
-use decision::Decision;
 use planning::{Imagined, Pilot};
 pub use scale::RunningScale;
 
+use super::decision::Decision;
 use super::warm_up::RandomActions;
 use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::Spec;

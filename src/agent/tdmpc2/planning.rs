@@ -1,7 +1,7 @@
 //! Planning in latent space (Hansen et al. 2024, section 3.2): what the planner maximises, and a planner for each environment.
 
 use super::TdMpc2Config;
-use super::decision::Held;
+use crate::agent::decision::Held;
 use crate::model::implicit::{FrozenModel, ImplicitModel, normals};
 use crate::nn::values;
 use crate::plan::{ActionSequences, GuidedMppi, Objective, PlanObserver, Planner};
