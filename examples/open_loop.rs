@@ -87,7 +87,7 @@ struct Row {
     horizon: usize,
     rmse: f64,
     rmse_p90: f64,
-    coverage90: f64,
+    coverage90: Option<f64>,
 }
 
 fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {

@@ -284,7 +284,7 @@ fn sets_of_starts_share_no_seed() {
 fn presets_of_a_task_agree_on_their_evaluations() {
     let registry = Registry::standard();
     for task in registry.env_names() {
-        let configs = ["pets", "dreamer", "planet", "size1m", "sac"]
+        let configs = ["pets", "dreamer", "planet", "size1m", "tdmpc2", "sac"]
             .map(|method| registry.config(task, method, 0, None, None).expect("a preset"));
         let protocol = |c: &RunConfig| (c.evaluate_every, c.evaluation_episodes, c.test_episodes, c.starts);
         for config in &configs {

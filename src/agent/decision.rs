@@ -33,10 +33,18 @@ pub(super) struct Decision {
     steps: usize,
 }
 
+/// A decision that is over.
+#[derive(Debug)]
+pub(super) enum Over {
+    /// It lasted as long as it should, or until the task itself ended. The reward is the mean.
+    Whole(Transition),
+    /// The time limit cut it short: what follows from holding its action is unknown. The observation that it began with.
+    Short(Vec<f32>),
+}
+
 impl Decision {
-    /// Adds a time step. When the decision is over, after `steps` of them or at the end of the episode, the whole of it: its
-    /// reward is the mean.
-    pub fn join(&mut self, t: &Transition, steps: usize) -> Option<Transition> {
+    /// Adds a time step; the decision is over after `steps` of them, or at the end of the episode.
+    pub fn join(&mut self, t: &Transition, steps: usize) -> Option<Over> {
         let joined = match self.so_far.take() {
             None => {
                 self.steps = 1;
@@ -48,11 +56,14 @@ impl Decision {
                 Transition { obs, action, reward, ..t.clone() }
             }
         };
-        if self.steps >= steps || t.terminated || t.truncated {
-            return Some(joined);
+        if self.steps >= steps || t.terminated {
+            Some(Over::Whole(joined))
+        } else if t.truncated {
+            Some(Over::Short(joined.obs))
+        } else {
+            self.so_far = Some(joined);
+            None
         }
-        self.so_far = Some(joined);
-        None
     }
 
     /// Drops what has been joined: a new episode begins.
@@ -61,13 +72,15 @@ impl Decision {
     }
 }
 
-/// An episode as decisions of `steps` time steps each.
+/// An episode as decisions of `steps` time steps each, without one that the time limit cut short.
 pub(super) fn in_decisions(episode: &Episode, steps: usize) -> Episode {
-    let last = episode.observations.last().filter(|_| !episode.rewards.len().is_multiple_of(steps));
+    let count = episode.rewards.len();
+    let whole = if episode.terminated { count.div_ceil(steps) } else { count / steps };
+    let mean = |rewards: &[f32]| rewards.iter().sum::<f32>() / rewards.len() as f32;
     Episode {
-        observations: episode.observations.iter().step_by(steps).chain(last).cloned().collect(),
-        actions: episode.actions.iter().step_by(steps).cloned().collect(),
-        rewards: episode.rewards.chunks(steps).map(|r| r.iter().sum::<f32>() / r.len() as f32).collect(),
+        observations: (0..=whole).map(|i| episode.observations[(i * steps).min(count)].clone()).collect(),
+        actions: episode.actions.iter().step_by(steps).take(whole).cloned().collect(),
+        rewards: episode.rewards.chunks(steps).take(whole).map(mean).collect(),
         terminated: episode.terminated,
     }
 }
@@ -76,26 +89,35 @@ pub(super) fn in_decisions(episode: &Episode, steps: usize) -> Episode {
 mod tests {
     use super::*;
 
-    /// Seven time steps are decisions of three, three and one; what is recorded is what was replayed.
+    /// Seven time steps are two decisions of three, and one that was cut short: it counts if the task itself ended. What is
+    /// recorded is what was replayed.
     #[test]
     fn decisions_join_what_belongs_together() {
-        let (mut held, mut decision, mut decisions) = (Held::default(), Decision::default(), Vec::new());
-        let mut recorded = Episode { observations: vec![vec![0.0]], ..Episode::default() };
-        for i in 0..7_u8 {
-            let (now, next_obs) = (f32::from(i), vec![f32::from(i) + 1.0]);
-            let action = held.next(3, || vec![now]);
-            assert_eq!(action, [f32::from(i / 3 * 3)]);
-            recorded.observations.push(next_obs.clone());
-            recorded.actions.push(action.clone());
-            recorded.rewards.push(now);
-            let t = Transition { obs: vec![now], action, reward: now, next_obs, terminated: false, truncated: i == 6 };
-            decisions.extend(decision.join(&t, 3));
+        for terminated in [false, true] {
+            let (mut held, mut decision, mut decisions) = (Held::default(), Decision::default(), Vec::new());
+            let mut recorded = Episode { observations: vec![vec![0.0]], terminated, ..Episode::default() };
+            for i in 0..7_u8 {
+                let (now, next_obs) = (f32::from(i), vec![f32::from(i) + 1.0]);
+                let action = held.next(3, || vec![now]);
+                assert_eq!(action, [f32::from(i / 3 * 3)]);
+                recorded.observations.push(next_obs.clone());
+                recorded.actions.push(action.clone());
+                recorded.rewards.push(now);
+                let [terminated, truncated] = [terminated, !terminated].map(|end| end && i == 6);
+                let t = Transition { obs: vec![now], action, reward: now, next_obs, terminated, truncated };
+                decisions.extend(decision.join(&t, 3));
+            }
+            let found = decisions.iter().map(|over| match over {
+                Over::Whole(t) => vec![t.obs[0], t.action[0], t.reward, t.next_obs[0]],
+                Over::Short(obs) => obs.clone(),
+            });
+            let last = if terminated { vec![6.0, 6.0, 6.0, 7.0] } else { vec![6.0] };
+            assert_eq!(found.collect::<Vec<_>>(), [vec![0.0, 0.0, 1.0, 3.0], vec![3.0, 3.0, 4.0, 6.0], last]);
+            let coarse = in_decisions(&recorded, 3);
+            let count = if terminated { 3 } else { 2 };
+            assert_eq!(coarse.observations.concat(), [0.0, 3.0, 6.0, 7.0][..=count]);
+            assert_eq!(coarse.actions.concat(), [0.0, 3.0, 6.0][..count]);
+            assert_eq!(coarse.rewards, [1.0, 4.0, 6.0][..count]);
         }
-        let found: Vec<_> = decisions.iter().map(|t| (t.obs[0], t.action[0], t.reward, t.next_obs[0])).collect();
-        assert_eq!(found, [(0.0, 0.0, 1.0, 3.0), (3.0, 3.0, 4.0, 6.0), (6.0, 6.0, 6.0, 7.0)]);
-        assert!(decisions[2].truncated && !decisions[1].truncated);
-        let coarse = in_decisions(&recorded, 3);
-        assert_eq!(coarse.observations.concat(), [0.0, 3.0, 6.0, 7.0]);
-        assert_eq!((coarse.actions.concat(), coarse.rewards), (vec![0.0, 3.0, 6.0], vec![1.0, 4.0, 6.0]));
     }
 }

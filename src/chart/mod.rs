@@ -29,8 +29,9 @@ use axis::{Axis, fits};
 use draw::Frame;
 pub use panels::Panels;
 
-/// Colours that colour-blind readers can tell apart (Okabe and Ito).
-pub const PALETTE: [RGBColor; 7] = [
+/// Colours that colour-blind readers can tell apart: those of Okabe and Ito, with Tol's wine red for their yellow, which is too
+/// bright for a line.
+pub const PALETTE: [RGBColor; 8] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -38,6 +39,7 @@ pub const PALETTE: [RGBColor; 7] = [
     RGBColor(230, 159, 0),
     RGBColor(86, 180, 233),
     RGBColor(0, 0, 0),
+    RGBColor(136, 34, 85),
 ];
 /// The font of all figures.
 pub const FONT: &str = "sans-serif";

@@ -65,10 +65,10 @@ pub struct OpenLoop {
     #[doc(alias = "RMSE")]
     pub rmse: f64,
     /// Negative log-likelihood in nats, mean over features (in those units) and start times. The predicted distribution is a
-    /// Gaussian with mean and variance of the particles.
-    pub nll: f64,
-    /// Coverage of the 90 % prediction interval, a fraction.
-    pub coverage90: f64,
+    /// Gaussian with mean and variance of the particles. None for a model that predicts one outcome and no uncertainty.
+    pub nll: Option<f64>,
+    /// Coverage of the 90 % prediction interval, a fraction. None for the same.
+    pub coverage90: Option<f64>,
     /// 90th percentile over start times of the error whose median is `rmse`.
     pub rmse_p90: f64,
 }
@@ -136,6 +136,7 @@ impl OpenLoopModel for Propagated<'_> {
 /// Compares predictions over `k` time steps, `[particles, starts, observation]`, with the episodes.
 fn evaluate(features: &[(usize, f32)], starts: &[(&Episode, usize)], predictions: &[f32], k: usize) -> OpenLoop {
     let width = starts[0].0.observations[0].len();
+    let particles_of_each = predictions.len() / width / starts.len();
     let mut squares = vec![0.0; starts.len()];
     let mut compared = 0;
     let mut forecasts = Vec::new();
@@ -152,8 +153,7 @@ fn evaluate(features: &[(usize, f32)], starts: &[(&Episode, usize)], predictions
         for (s, (episode, t)) in starts.iter().enumerate() {
             let particles =
                 predictions.chunks_exact(width).skip(s).step_by(starts.len()).map(|state| f64::from(state[i]));
-            let count = predictions.len() / width / starts.len();
-            let mean = particles.clone().sum::<f64>() / count as f64;
+            let mean = particles.clone().sum::<f64>() / particles_of_each as f64;
             let outcome = f64::from(episode.observations[t + k][i]);
             squares[s] += ((mean - outcome) / unit).powi(2);
             forecasts.push(GaussianForecast { mean, std: std(particles).max(1e-9), outcome });
@@ -164,11 +164,12 @@ fn evaluate(features: &[(usize, f32)], starts: &[(&Episode, usize)], predictions
     errors.sort_by(f64::total_cmp);
     let quantile = |q: f64| errors[(q * (errors.len() - 1) as f64).round() as usize];
     let count = forecasts.len().max(1) as f64;
+    let uncertain = particles_of_each > 1;
     OpenLoop {
         horizon: k,
         rmse: quantile(0.5),
-        nll: (forecasts.iter().map(GaussianForecast::nll).sum::<f64>() - log_units) / count,
-        coverage90: coverage(&forecasts, 0.9),
+        nll: uncertain.then(|| (forecasts.iter().map(GaussianForecast::nll).sum::<f64>() - log_units) / count),
+        coverage90: uncertain.then(|| coverage(&forecasts, 0.9)),
         rmse_p90: quantile(0.9),
     }
 }
@@ -221,5 +222,7 @@ mod tests {
         let episode = Episode { observations, actions: vec![vec![0.0]; 30], ..Episode::default() };
         let rows = open_loop(&KnowsTheFirst, &spec, &[episode], &mut rng::stream(0, "starts"));
         assert!(rows.len() == HORIZONS.len() && rows.iter().all(|row| row.rmse == 0.0), "{rows:?}");
+        // It predicts one outcome, without an uncertainty that could be right or wrong.
+        assert!(rows.iter().all(|row| row.nll.is_none() && row.coverage90.is_none()), "{rows:?}");
     }
 }

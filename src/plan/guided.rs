@@ -8,7 +8,7 @@
 //!     R = their returns; keep the `elites` best
 //!     w = exp(R / temperature) / sum exp(R / temperature)           over the elites
 //!     mean = sum w a;  deviation = sqrt(sum w (a - mean)^2), within its bounds
-//! execute an elite, drawn with probability w
+//! execute an elite, drawn with probability w, or the mean
 //! ```
 
 use serde::{Deserialize, Serialize};
@@ -38,6 +38,8 @@ pub struct GuidedConfig {
     pub min_deviation: f64,
     /// Upper bound of the standard deviation, with which each search starts.
     pub max_deviation: f64,
+    /// Execute the mean of the elites instead of one that is drawn: smoother, and less is explored.
+    pub execute_mean: bool,
 }
 
 impl Default for GuidedConfig {
@@ -51,6 +53,7 @@ impl Default for GuidedConfig {
             temperature: 2.0,
             min_deviation: 0.05,
             max_deviation: 2.0,
+            execute_mean: false,
         }
     }
 }
@@ -64,6 +67,7 @@ ranges!(GuidedConfig {
     temperature: 1e-6..=1e6,
     min_deviation: 0.0..=100.0,
     max_deviation: 0.0..=100.0,
+    execute_mean: Any,
 }
 require proposals <= population => "`proposals` must not exceed `population`, which contains them";
 require elites <= population => "`elites` must not exceed `population`";
@@ -162,7 +166,9 @@ impl Planner for GuidedMppi {
             let weights = weights(order.iter().map(|i| returns[*i]), config.temperature);
             self.fit(&elites, &weights);
             observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &self.mean });
-            if index + 1 == config.iterations {
+            if index + 1 == config.iterations && config.execute_mean {
+                plan.actions = self.mean.iter().map(|a| *a as f32).collect();
+            } else if index + 1 == config.iterations {
                 let gumbels = weights.iter().map(|_| gumbel(rng)).collect::<Vec<f64>>();
                 plan.actions = elites[drawn(&weights, &gumbels)].to_vec();
             }

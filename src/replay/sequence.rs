@@ -109,14 +109,24 @@ impl SequenceReplay {
         self.push_time_step(&t.obs, &t.action, reward, Flags { first, last: false, terminal: false });
         self.arrival_reward = Some(t.reward);
         if t.terminated || t.truncated {
-            let no_action = vec![0.0; self.action_size];
+            self.close(&t.next_obs, t.terminated);
+        }
+    }
+
+    /// Ends the current episode with its last observation, unless it has ended already: for what cannot be told by a last
+    /// [`push`](SequenceReplay::push), because the last action has no whole step.
+    ///
+    /// # Panics
+    /// If the observation has the wrong length.
+    pub fn close(&mut self, obs: &[f32], terminal: bool) {
+        assert!(obs.len() == self.observation_size, "sizes of this buffer");
+        if let Some(reward) = self.arrival_reward.take() {
             self.push_time_step(
-                &t.next_obs,
-                &no_action,
-                t.reward,
-                Flags { first: false, last: true, terminal: t.terminated },
+                obs,
+                &vec![0.0; self.action_size],
+                reward,
+                Flags { first: false, last: true, terminal },
             );
-            self.arrival_reward = None;
         }
     }
 

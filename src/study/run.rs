@@ -282,14 +282,18 @@ mod tests {
         let config = registry.config("pendulum", "debug", 0, None, None).expect("a preset");
         let mut run = registry.open_run(&config, folder.path()).expect("a new run");
         let loss = LossRow { step: 1, name: "critic".into(), value: f32::NAN };
-        let open_loop = OpenLoop { horizon: 1, rmse: 0.1, nll: f64::INFINITY, coverage90: 0.9, rmse_p90: 0.3 };
-        let model = ModelRow { step: 1, open_loop };
+        let of_particles =
+            OpenLoop { horizon: 1, rmse: 0.1, nll: Some(f64::INFINITY), coverage90: Some(0.9), rmse_p90: 0.3 };
+        let of_one = OpenLoop { horizon: 2, nll: None, coverage90: None, ..of_particles.clone() };
+        let model = [of_particles, of_one].map(|open_loop| ModelRow { step: 1, open_loop });
         run.progress.losses.push(loss);
-        run.progress.model.push(model.clone());
+        run.progress.model.extend(model.clone());
         run.save().expect("a writable folder");
         drop(run);
         let again = registry.open_run(&config, folder.path()).expect("a run to go on with").progress;
         assert!(again.losses[0].value.is_nan());
-        assert_eq!(again.model, [model]);
+        assert_eq!(again.model, model);
+        let table = std::fs::read_to_string(folder.path().join("model.csv")).expect("a table");
+        assert_eq!(table.lines().skip(1).collect::<Vec<_>>(), ["1,1,0.1,inf,0.9,0.3", "1,2,0.1,,,0.3"]);
     }
 }

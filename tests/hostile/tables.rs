@@ -377,6 +377,22 @@ fn a_model_that_diverged_is_reported() {
     }
 }
 
+/// A model that predicts one outcome has no interval: no number was left out.
+#[test]
+fn a_model_without_uncertainty_is_reported() {
+    let mut study = Study::committed("quick");
+    study.lines(1, |lines| {
+        let columns: Vec<String> = lines[0].split(',').map(String::from).collect();
+        for line in lines.iter_mut().filter(|line| line.contains(",dreamer,")) {
+            let cells = line.split(',').zip(&columns);
+            let kept = cells.map(|(cell, name)| if ["nll", "coverage90"].contains(&name.as_str()) { "" } else { cell });
+            *line = kept.collect::<Vec<_>>().join(",");
+        }
+    });
+    let text = study.report().expect("a report");
+    assert!(!text.contains("numbers about `dreamer`"), "{text}");
+}
+
 #[test]
 fn rows_that_are_doubled_missing_or_moved_are_named() {
     let quick = Study::committed("quick");

@@ -1,7 +1,7 @@
 //! What SAC does in its environment: it explores, acts as well as it can, and records what comes of it.
 
 use super::Sac;
-use crate::agent::decision::Held;
+use crate::agent::decision::{Held, Over};
 use crate::agent::warm_up::RandomActions;
 use crate::agent::{Agent, Losses, Mode, Slot};
 use crate::nn::{Grad, SquashedGaussian, tensor, values};
@@ -38,7 +38,8 @@ impl Agent for Sac {
     }
 
     fn observe(&mut self, transition: &Transition) {
-        if let Some(decision) = self.decision.join(transition, self.config.action_repeat) {
+        // A decision that the time limit cuts short is left out: it tells nothing about a whole one.
+        if let Some(Over::Whole(decision)) = self.decision.join(transition, self.config.action_repeat) {
             self.replay.push(&decision);
         }
         self.observed += 1;

@@ -66,8 +66,9 @@ impl Checkpoint for Sac {
         self.critic_optimiser.load(state, "critics", &self.critics)?;
         self.replay.load(state, "replay")?;
         let (held, most) = self.replay.pushes().into_inner();
-        let observed = held..=most.saturating_mul(self.config.action_repeat as u64).min(MAX_COUNT);
-        let counts = state.counts_within("counts", &[observed, 0..=MAX_COUNT])?;
+        // Decisions that the time limit cuts short leave no trace.
+        let most = if self.config.action_repeat == 1 { most } else { MAX_COUNT };
+        let counts = state.counts_within("counts", &[held..=most, 0..=MAX_COUNT])?;
         self.temperature.moments = [first, second];
         self.temperature.steps = steps.max(0.0) as i32;
         self.observed = counts[0] as usize;

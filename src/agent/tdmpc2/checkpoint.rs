@@ -76,12 +76,13 @@ impl Checkpoint for TdMpc2 {
         self.policy_optimiser.load(state, "policy", &self.networks.policy)?;
         self.probe_optimiser.load(state, "probe", &self.networks.probe)?;
         self.replay.load(state, "replay")?;
-        let most = self.replay.most_pushes().saturating_mul(self.config.action_repeat as u64).min(MAX_COUNT);
+        // Decisions that the time limit cuts short leave no trace.
+        let most = if self.config.action_repeat == 1 { self.replay.most_pushes() } else { MAX_COUNT };
         self.observed = state.count("counts", 0..=most)? as usize;
         self.scale = RunningScale::new(scale.max(f32::MIN_POSITIVE));
         self.update_credit = update_credit;
         self.rng = own;
-        self.pilot = Pilot::new(&self.config, self.spec.action_size, planner);
+        self.pilot = Pilot::new(&self.config, &self.spec, planner);
         self.decision.reset();
         self.random.reset();
         Ok(())

@@ -27,12 +27,19 @@ pub struct TdMpc2Config {
     pub warm_up: usize,
     /// Exponent of the spectrum of the random actions: 0 is white noise, 1 pink noise.
     pub warm_up_noise_beta: f64,
+    /// Exponent of the spectrum of the noise around a plan while it explores; white if absent.
+    #[doc(alias = "pink noise")]
+    pub exploration_noise_beta: Option<f64>,
     /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
     /// Discount factor gamma, per decision. Without one it follows from the length of an episode:
     /// [`TdMpc2Config::discount_for`].
     #[doc(alias = "gamma")]
     pub discount: Option<f32>,
+    /// Decisions of reward in a value target, as far as the slice of experience goes: n-step returns. Values need some 1 / (1 -
+    /// discount) times 1 / `target_rate` updates to become those of far rewards; with n steps, n times fewer.
+    #[doc(alias = "multi-step return")]
+    pub n_step: usize,
     /// Step size (Adam).
     pub learning_rate: f32,
     /// The encoder's step size, as a fraction of the others'.
@@ -60,8 +67,10 @@ impl Default for TdMpc2Config {
             updates_per_step: 1.0,
             warm_up: 1000,
             warm_up_noise_beta: 0.0,
+            exploration_noise_beta: None,
             replay: 1_000_000,
             discount: None,
+            n_step: 1,
             learning_rate: 3e-4,
             encoder_rate: 0.3,
             max_gradient_norm: 20.0,
@@ -88,8 +97,10 @@ ranges!(TdMpc2Config {
     updates_per_step: 0.0..=1000.0,
     warm_up: 0..=1_000_000_000,
     warm_up_noise_beta: 0.0..=10.0,
+    exploration_noise_beta: 0.0..=10.0,
     replay: 2..=100_000_000,
     discount: 0.0..=1.0,
+    n_step: 1..=1000,
     learning_rate: 0.0..=1.0,
     encoder_rate: 0.0..=1e3,
     max_gradient_norm: 1e-6..=1e9,

@@ -27,7 +27,7 @@ pub use config::TdMpc2Config;
 use planning::{Imagined, Pilot};
 pub use scale::RunningScale;
 
-use super::decision::Decision;
+use super::decision::{Decision, Over};
 use super::warm_up::RandomActions;
 use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::Spec;
@@ -152,7 +152,7 @@ impl TdMpc2 {
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
             decision: Decision::default(),
             frozen: None,
-            pilot: Pilot::new(&config, spec.action_size, rng::stream(seed, "tdmpc2 planner")),
+            pilot: Pilot::new(&config, spec, rng::stream(seed, "tdmpc2 planner")),
             slots: Slots::default(),
             spec: spec.clone(),
             rng,
@@ -175,12 +175,12 @@ impl TdMpc2 {
         self.discount
     }
 
-    /// What the planners plan in, and the planners of the slots.
-    fn imagined(&mut self) -> (Imagined<'_>, &mut Pilot, &mut Slots<Pilot>) {
-        let Self { networks, frozen, discount, pilot, slots, .. } = self;
+    /// What the planners plan in, the planner that learns, those of the slots, and how one of the latter is made.
+    fn imagined(&mut self) -> (Imagined<'_>, &mut Pilot, &mut Slots<Pilot>, impl Fn(usize) -> Pilot) {
+        let Self { config, spec, networks, frozen, discount, pilot, slots, .. } = self;
         let Networks { model, policy, .. } = networks;
         let frozen = frozen.get_or_insert_with(|| FrozenModel::new(model, policy));
-        (Imagined { model, frozen, discount: *discount }, pilot, slots)
+        (Imagined { model, frozen, discount: *discount }, pilot, slots, |i| Pilot::of_slot(config, spec, i))
     }
 }
 
@@ -195,29 +195,23 @@ impl Agent for TdMpc2 {
             let Self { random, rng, pilot, config, .. } = self;
             return pilot.held.next(config.action_repeat, || random.next(rng));
         }
-        let (config, action_size) = (self.config.clone(), self.spec.action_size);
-        let (world, pilot, slots) = self.imagined();
+        let (world, pilot, slots, fresh) = self.imagined();
         match mode {
             Mode::Explore => pilot.act(world, obs, true, &mut |_| {}),
-            Mode::Evaluate => {
-                let pilot = slots.state(0, |i| Pilot::of_slot(&config, action_size, i));
-                pilot.act(world, obs, false, &mut |_| {})
-            }
+            Mode::Evaluate => slots.state(0, fresh).act(world, obs, false, &mut |_| {}),
         }
     }
 
     fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        let (config, action_size) = (self.config.clone(), self.spec.action_size);
-        let (world, _, pilots) = self.imagined();
-        let pilots = pilots.states(slots, |i| Pilot::of_slot(&config, action_size, i)).into_par_iter();
+        let (world, _, pilots, fresh) = self.imagined();
+        let pilots = pilots.states(slots, fresh).into_par_iter();
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
         pilots.zip(observations).map(|(pilot, obs)| pilot.act(world, obs, false, &mut |_| {})).collect()
     }
 
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        let (config, action_size) = (self.config.clone(), self.spec.action_size);
-        let (world, _, pilots) = self.imagined();
-        let pilot = pilots.states(&[*slot], |i| Pilot::of_slot(&config, action_size, i)).remove(0);
+        let (world, _, pilots, fresh) = self.imagined();
+        let pilot = pilots.states(&[*slot], fresh).remove(0);
         // A few of each iteration's candidates, from the best to the worst; those of the last iteration come first.
         let (mut sequences, mut returns) = (Vec::new(), Vec::new());
         let mut observer = |iteration: &Iteration| {
@@ -234,7 +228,7 @@ impl Agent for TdMpc2 {
         }
         let Networks { model, probe, .. } = &self.networks;
         let start = model.encode(&slot.obs.repeat(returns.len()));
-        let futures = probe.rollout(model, &start, &sequences, config.planner.horizon);
+        let futures = probe.rollout(model, &start, &sequences, self.config.planner.horizon);
         let width = slot.obs.len();
         let trajectories = returns.iter().enumerate().map(|(i, value)| ImaginedTrajectory {
             observations: futures.iter().map(|rows| rows[i * width..][..width].to_vec()).collect(),
@@ -245,8 +239,10 @@ impl Agent for TdMpc2 {
     }
 
     fn observe(&mut self, transition: &Transition) {
-        if let Some(decision) = self.decision.join(transition, self.config.action_repeat) {
-            self.replay.push(&decision);
+        match self.decision.join(transition, self.config.action_repeat) {
+            Some(Over::Whole(decision)) => self.replay.push(&decision),
+            Some(Over::Short(obs)) => self.replay.close(&obs, false),
+            None => {}
         }
         self.observed += 1;
         if transition.terminated || transition.truncated {

@@ -2,6 +2,8 @@
 
 use super::TdMpc2Config;
 use crate::agent::decision::Held;
+use crate::agent::warm_up::RandomActions;
+use crate::env::Spec;
 use crate::model::implicit::{FrozenModel, ImplicitModel, normals};
 use crate::nn::values;
 use crate::plan::{ActionSequences, GuidedMppi, Objective, PlanObserver, Planner};
@@ -53,51 +55,67 @@ pub(super) struct Pilot {
     /// The action that is held.
     pub held: Held,
     action_repeat: usize,
+    /// What it explores with, unless that is white noise.
+    noise: Option<RandomActions>,
     pub rng: Rng,
 }
 
 impl Pilot {
-    pub fn new(config: &TdMpc2Config, action_size: usize, rng: Rng) -> Self {
-        let planner = GuidedMppi::new(config.planner.clone(), action_size);
-        Self { planner, held: Held::default(), action_repeat: config.action_repeat, rng }
+    pub fn new(config: &TdMpc2Config, spec: &Spec, rng: Rng) -> Self {
+        let decisions = spec.horizon.div_ceil(config.action_repeat);
+        Self {
+            planner: GuidedMppi::new(config.planner.clone(), spec.action_size),
+            held: Held::default(),
+            action_repeat: config.action_repeat,
+            noise: config.exploration_noise_beta.map(|beta| RandomActions::new(beta, decisions, spec.action_size)),
+            rng,
+        }
     }
 
     /// The planner of a slot, which depends on nothing but the slot's index.
-    pub fn of_slot(config: &TdMpc2Config, action_size: usize, index: usize) -> Self {
-        Self::new(config, action_size, rng::stream(index as u64, "tdmpc2 seat"))
+    pub fn of_slot(config: &TdMpc2Config, spec: &Spec, index: usize) -> Self {
+        Self::new(config, spec, rng::stream(index as u64, "tdmpc2 seat"))
     }
 
     /// A new episode begins.
     pub fn reset(&mut self) {
         self.planner.reset();
         self.held.reset();
+        self.noise.iter_mut().for_each(RandomActions::reset);
     }
 
     /// The next action from `obs`; plans when the last one has been held long enough. To `explore`, noise of the plan's own
     /// deviation is added.
     pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
-        let Self { planner, held, action_repeat, rng } = self;
-        held.next(*action_repeat, || plan(planner, rng, world, obs, explore, observer))
+        let Self { planner, held, action_repeat, noise, rng } = self;
+        held.next(*action_repeat, || {
+            let planned = plan(planner, rng, world, obs, observer);
+            let deviates: Vec<f64> = match noise {
+                _ if !explore => vec![0.0; planned.len()],
+                Some(noise) => noise.deviates(rng).into_iter().map(f64::from).collect(),
+                None => planned.iter().map(|_| rng::normal(rng)).collect(),
+            };
+            let numbers = planned.iter().zip(planner.deviation()).zip(deviates);
+            let action = numbers.map(|((a, std), deviate)| (f64::from(*a) + std * deviate).clamp(-1.0, 1.0) as f32);
+            action.collect()
+        })
     }
 }
 
+/// The first action of a plan; the rest of it stays for the next search.
 fn plan(
     planner: &mut GuidedMppi,
     rng: &mut Rng,
     world: Imagined,
     obs: &[f32],
-    explore: bool,
     observer: &mut PlanObserver,
 ) -> Vec<f32> {
     let Imagined { model, frozen, discount } = world;
     let z = model.encode(obs);
     let critics = model.config().critics;
     let mut objective = LatentReturns { model: frozen, z: values(&z), critics, discount, rng: rng::fork(rng) };
-    let plan = planner.plan(&mut objective, observer, rng);
-    let mut noise = || if explore { rng::normal(rng) } else { 0.0 };
-    let numbers = plan.actions.iter().zip(planner.deviation());
-    let action = numbers.map(|(a, deviation)| (f64::from(*a) + deviation * noise()).clamp(-1.0, 1.0) as f32);
-    let action = action.collect();
+    let mut actions = planner.plan(&mut objective, observer, rng).actions;
+    actions.truncate(planner.deviation().len());
     planner.shift(1);
-    action
+    actions
 }

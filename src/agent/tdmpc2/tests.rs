@@ -105,7 +105,7 @@ fn an_update_is_the_references() {
     let encoded = NoneTape.rows(&z, 2, 4);
     let actions = policy.sample_on(&mut NoneTape, &encoded, &noise[..8]).0;
     let q = model.values(&target.some(&device(), &pair), &encoded, &actions);
-    let targets = update::bootstrapped(&batch, &q, 0.95);
+    let targets = update::bootstrapped(&batch, &q, 0.95, 1);
     targets.iter().zip([0.981_567, 0.452_613, 0.030_633, 0.663_528]).for_each(|(y, expected)| near("y", *y, expected));
 
     let mut tape = OwnedTape::default();
@@ -137,6 +137,47 @@ fn an_update_is_the_references() {
     near("policy", ops::mean(&loss.climb) + ops::mean(&loss.entropy), -0.000_994);
     let gradients = ops::total(tape, &[(1.0, loss.climb), (1.0, loss.entropy)]).backward();
     near("policy's gradient", norm(&gradients, policy.parameters().into_iter().map(|(_, p)| p)), 0.310_840);
+}
+
+/// Two slices of three steps, the second with the end of its task; by hand.
+#[test]
+fn targets_of_several_steps_end_with_the_slice() {
+    let batch = SequenceBatch {
+        sequences: 2,
+        length: 4,
+        rewards: vec![0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        terminal: [vec![false; 7], vec![true]].concat(),
+        ..SequenceBatch::default()
+    };
+    // The smaller of two critics.
+    let q = [[10.0, 20.0, 30.0, 40.0, 50.0, 60.0], [90.0; 6]].concat();
+    for (n_step, expected) in [
+        (1, [6.0, 12.0, 18.0, 24.0, 30.0, 6.0]),
+        (2, [1.0 + 1.5 + 7.5, 2.0 + 2.0 + 10.0, 3.0 + 2.5 + 12.5, 4.0 + 3.0, 30.0, 6.0]),
+        (9, [1.0 + 1.5 + 1.25 + 6.25, 2.0 + 2.0 + 1.5, 3.0 + 2.5 + 12.5, 4.0 + 3.0, 30.0, 6.0]),
+    ] {
+        assert_eq!(update::bootstrapped(&batch, &q, 0.5, n_step), expected, "{n_step} steps");
+    }
+}
+
+/// What follows from holding an action is not told by a decision that the time limit cut short.
+#[test]
+fn a_decision_that_was_cut_short_is_not_learned_from() {
+    let spec = Spec::new("seven", [Feature::new("time")], 1, 7, 0.05);
+    let config = TdMpc2Config { action_repeat: 3, ..TdMpc2Config::default() };
+    let mut agent = TdMpc2::new(&spec, config, 0).expect("usable settings");
+    for i in (0..7_u8).chain(0..7) {
+        let (now, next) = (f32::from(i), f32::from(i) + 1.0);
+        let (obs, next_obs, action) = (vec![now], vec![next], vec![0.0]);
+        agent.observe(&Transition { obs, action, reward: next, next_obs, terminated: false, truncated: i == 6 });
+    }
+    assert_eq!(agent.replay.len(), 6);
+    let batch = agent.replay.sample_within_episodes(20, 3, &mut rng::stream(0, "slices")).expect("two whole episodes");
+    for (t, (obs, reward)) in [(0.0, 0.0), (3.0, 2.0), (6.0, 5.0)].into_iter().enumerate() {
+        let rows = t * 20..(t + 1) * 20;
+        assert!(batch.obs[rows.clone()] == [obs; 20] && batch.rewards[rows.clone()] == [reward; 20]);
+        assert_eq!(batch.last[rows], [t == 2; 20]);
+    }
 }
 
 /// The values that a pair of critics are asked for are never those of one critic twice, and all pairs are drawn.

@@ -23,7 +23,7 @@ impl TdMpc2 {
         let mut losses = Losses::new();
 
         // The model.
-        let (encoded, targets) = networks.value_targets(&batch, *discount, rng);
+        let (encoded, targets) = networks.value_targets(&batch, *discount, config.n_step, rng);
         let mut tape = OwnedTape::default();
         let loss = networks.model.loss(&mut tape, &batch, &encoded, &targets);
         let weighted = loss.weighted(&config.model);
@@ -78,16 +78,22 @@ impl Networks {
     /// y_t = r_t + discount (1 - terminal_t) min(Q'_i, Q'_j)(z_t+1, a),   a ~ p(z_t+1),  z_t+1 = h(o_t+1)
     /// ```
     ///
-    /// with two of the target critics, drawn anew each time. No gradient flows into them (stop-gradient).
+    /// or what `n_step` rewards make of it, with two of the target critics, drawn anew each time. No gradient flows into them (stop-gradient).
     #[doc(alias = "Bellman")]
-    pub(super) fn value_targets(&self, batch: &SequenceBatch, discount: f32, rng: &mut Rng) -> (Tensor3, Vec<f32>) {
+    pub(super) fn value_targets(
+        &self,
+        batch: &SequenceBatch,
+        discount: f32,
+        n_step: usize,
+        rng: &mut Rng,
+    ) -> (Tensor3, Vec<f32>) {
         let Self { model, policy, target, .. } = self;
         let obs_size = batch.obs.len() / (batch.length * batch.sequences);
         let encoded = model.encode(&batch.obs[batch.sequences * obs_size..]);
         let actions = policy.sample(&encoded, rng);
         let pair = target.some(model.device(), &two_of(model.config().critics, rng));
         let q = model.values(&pair, &encoded, &actions);
-        (encoded, bootstrapped(batch, &q, discount))
+        (encoded, bootstrapped(batch, &q, discount, n_step))
     }
 
     /// The policy's loss on latent states `z` (`[1, (H + 1) x sequences, latent]`, step after step):
@@ -146,11 +152,17 @@ impl Networks {
     }
 }
 
-/// Value targets `[H x sequences]` from the values `[2, H x sequences]` of two critics.
-pub(super) fn bootstrapped(batch: &SequenceBatch, q: &[f32], discount: f32) -> Vec<f32> {
+/// Value targets `[H x sequences]` from the values `[2, H x sequences]` of two critics: the rewards of up to `n_step` steps,
+/// fewer at the end of the slices, and the value of the state that they lead to.
+pub(super) fn bootstrapped(batch: &SequenceBatch, q: &[f32], discount: f32, n_step: usize) -> Vec<f32> {
     let (one, other) = q.split_at(q.len() / 2);
-    let min_q = one.iter().zip(other).map(|(one, other)| one.min(*other));
     // A time step of the batch holds the reward for arriving there.
-    let arrivals = batch.rewards[batch.sequences..].iter().zip(&batch.terminal[batch.sequences..]);
-    arrivals.zip(min_q).map(|((reward, terminal), q)| reward + if *terminal { 0.0 } else { discount * q }).collect()
+    let (rewards, terminal) = (&batch.rewards[batch.sequences..], &batch.terminal[batch.sequences..]);
+    let target = |first: usize| {
+        let steps = (first..one.len()).step_by(batch.sequences).take(n_step);
+        let last = steps.clone().last().expect("the first itself");
+        let value = if terminal[last] { 0.0 } else { one[last].min(other[last]) };
+        steps.rev().fold(value, |value, i| rewards[i] + discount * value)
+    };
+    (0..one.len()).map(target).collect()
 }

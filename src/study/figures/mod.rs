@@ -26,7 +26,7 @@ pub(super) fn stem(task: &str, method: &str) -> String {
 }
 
 /// The methods that have the same colour of the palette in every study. Others take the colours that are left.
-const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "planet", "scripted", "random"];
+const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "planet", "scripted", "random", "tdmpc2"];
 
 /// The methods of a task, each with its colour.
 fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {

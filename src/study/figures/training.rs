@@ -11,7 +11,7 @@ use crate::error::Result;
 const HORIZONS: [u32; 3] = [1, 5, 15];
 
 /// The quality of a method's model over training: its open-loop prediction error at several horizons, and the coverage of
-/// its 90 % interval. Returns `false`, and draws nothing, if the method has no model.
+/// its 90 % interval, if it has one. Returns `false`, and draws nothing, if the method has no model.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -23,7 +23,9 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
         if !error.is_empty() {
             let label = format!("{horizon} step{} ahead", if horizon == 1 { "" } else { "s" });
             errors.push((colour, label.clone(), band(&error)));
-            coverages.push((colour, label, band(&coverage)));
+            if !coverage.is_empty() {
+                coverages.push((colour, label, band(&coverage)));
+            }
         }
     }
     if errors.is_empty() {
@@ -35,10 +37,13 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
         .y_ticks(11, tenths)
         .mark(1.0)
         .legend(SeriesLabelPosition::UpperRight);
-    let coverage =
-        over_training("coverage of the 90 % interval", &coverages).between(0.0, 1.03).y_ticks(11, percent).mark(0.9);
     let title = format!("{task}: open-loop predictions of {method} on held-out episodes");
-    save(&Panels::new(&title).panel(error).panel(coverage), path)?;
+    let mut panels = Panels::new(&title).panel(error);
+    if !coverages.is_empty() {
+        let coverage = over_training("coverage of the 90 % interval", &coverages);
+        panels = panels.panel(coverage.between(0.0, 1.03).y_ticks(11, percent).mark(0.9));
+    }
+    save(&panels, path)?;
     Ok(true)
 }
 
