@@ -22,6 +22,15 @@ pub struct ControlConfig {
     pub replan_every: usize,
     /// The actions between one planned action and the next, if `action_repeat` is more than 1.
     pub interpolation: Interpolation,
+    /// Subtracted from a plan's return, times the sum of its squared actions, over control steps: where the reward is
+    /// indifferent, the arm rests.
+    #[doc(alias = "control cost")]
+    pub effort_penalty: f32,
+    /// Subtracted from a plan's return, times the sum of the squared changes from one action to the next, over control steps,
+    /// the first from the last executed action: what makes planned motion smooth.
+    #[doc(alias = "jerk")]
+    #[doc(alias = "smoothness")]
+    pub change_penalty: f32,
 }
 
 /// How a plan of few actions becomes one of more control steps: a spline whose knots are the planned actions.
@@ -39,11 +48,23 @@ pub enum Interpolation {
 
 impl Default for ControlConfig {
     fn default() -> Self {
-        Self { action_repeat: 1, replan_every: 1, interpolation: Interpolation::Hold }
+        Self {
+            action_repeat: 1,
+            replan_every: 1,
+            interpolation: Interpolation::Hold,
+            effort_penalty: 0.0,
+            change_penalty: 0.0,
+        }
     }
 }
 
-ranges!(ControlConfig { action_repeat: 1..=1000, replan_every: 1..=1000, interpolation: Any });
+ranges!(ControlConfig {
+    action_repeat: 1..=1000,
+    replan_every: 1..=1000,
+    interpolation: Any,
+    effort_penalty: 0.0..=1e6,
+    change_penalty: 0.0..=1e6,
+});
 
 impl ControlConfig {
     /// Whether a plan holds what is executed of it.
@@ -191,6 +212,26 @@ impl Spline<'_> {
         }
     }
 
+    /// What a sequence of control steps costs, and the derivative with respect to each number, which is added to `slopes`
+    /// with a minus sign.
+    fn penalty(&self, steps: &[f32], slopes: Option<&mut [f32]>) -> f32 {
+        let ControlConfig { effort_penalty, change_penalty, .. } = *self.config;
+        if effort_penalty == 0.0 && change_penalty == 0.0 {
+            return 0.0;
+        }
+        let size = self.start.len();
+        let before = self.start.iter().chain(steps);
+        let changes: Vec<f32> = steps.iter().zip(before).map(|(a, before)| a - before).collect();
+        if let Some(slopes) = slopes {
+            for (i, slope) in slopes.iter_mut().enumerate() {
+                let next = changes.get(i + size).unwrap_or(&0.0);
+                *slope -= 2.0 * (effort_penalty * steps[i] + change_penalty * (changes[i] - next));
+            }
+        }
+        let squares = |values: &[f32]| values.iter().map(|x| x * x).sum::<f32>();
+        effort_penalty * squares(steps) + change_penalty * squares(&changes)
+    }
+
     fn in_control_steps(&self, sequences: &ActionSequences) -> ActionSequences {
         ActionSequences {
             horizon: sequences.horizon * self.config.action_repeat,
@@ -208,11 +249,18 @@ struct Interpolated<'a> {
 
 impl Objective for Interpolated<'_> {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
-        self.objective.returns(&self.spline.in_control_steps(sequences))
+        let steps = self.spline.in_control_steps(sequences);
+        let returns = self.objective.returns(&steps);
+        returns.iter().zip(steps.rows()).map(|(total, row)| total - self.spline.penalty(row, None)).collect()
     }
 
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
-        let (returns, gradients) = self.objective.gradients(&self.spline.in_control_steps(sequences));
+        let steps = self.spline.in_control_steps(sequences);
+        let (mut returns, mut gradients) = self.objective.gradients(&steps);
+        let slopes = gradients.chunks_exact_mut(steps.width());
+        for ((total, slopes), row) in returns.iter_mut().zip(slopes).zip(steps.rows()) {
+            *total -= self.spline.penalty(row, Some(slopes));
+        }
         // By the chain rule: a planned action has a part in the steps that lead to it, and in those that lead from it.
         let ActionSequences { horizon, actions, .. } = *sequences;
         let repeat = self.spline.config.action_repeat;
@@ -265,12 +313,13 @@ mod tests {
     #[test]
     fn gradients_are_those_of_the_planned_actions() {
         for interpolation in [Interpolation::Hold, Interpolation::Linear] {
-            let config = spline(interpolation);
+            let config = ControlConfig { effort_penalty: 0.2, change_penalty: 0.3, ..spline(interpolation) };
             let mut rng = crate::rng::stream(0, "interpolation");
             let weights: Vec<f32> = (0..12).map(|_| crate::rng::normal(&mut rng) as f32).collect();
             let mut linear = |c: &ActionSequences| -> Vec<f32> {
                 c.rows().map(|row| row.iter().zip(&weights).map(|(a, w)| a * w).sum()).collect()
             };
+            // Central differences of what is quadratic in the actions are exact.
             let mut objective =
                 Interpolated { objective: &mut linear, spline: Spline { config: &config, start: &[0.1, 0.2] } };
             let plans = ActionSequences { horizon: 3, actions: 2, values: vec![0.3, -0.2, 0.1, 0.5, -0.6, 0.4] };
