@@ -1,4 +1,4 @@
-//! Model predictive path integral control (MPPI; Williams et al. 2017, Algorithm 2) in the form of PDDM (Nagabandi et
+//! Model predictive path integral control (MPPI; Williams et al. 2017) in the form of PDDM (Nagabandi et
 //! al. 2019, "Filtering and Reward-Weighted Refinement"): the new mean is the average of all samples, weighted by the
 //! exponential of their returns, and the samples are low-pass filtered along the horizon.
 //!

@@ -17,6 +17,9 @@ pub struct ImplicitConfig {
     pub encoder: usize,
     /// Units of each of the two hidden layers of every other network.
     pub units: usize,
+    /// Whether the latent dynamics predict changes, `z' = SimNorm(ln z + d(z, a))`, so that a new model predicts that nothing
+    /// changes; otherwise `z' = SimNorm(d(z, a))`, as published.
+    pub residual: bool,
     /// Members of the ensemble of Q functions.
     pub critics: usize,
     /// Bins of the two-hot distributions of rewards and values, an odd number.
@@ -44,6 +47,7 @@ impl Default for ImplicitConfig {
             group: 8,
             encoder: 128,
             units: 128,
+            residual: false,
             critics: 2,
             bins: 101,
             bin_limit: 10.0,
@@ -61,6 +65,7 @@ ranges!(ImplicitConfig {
     group: 2..=4096,
     encoder: 1..=4096,
     units: 1..=4096,
+    residual: Any,
     critics: 2..=32,
     bins: 3..=1001,
     bin_limit: 0.1..=20.0,

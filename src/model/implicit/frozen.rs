@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::policy::log_std;
-use super::{ImplicitModel, PolicyPrior};
+use super::{ImplicitModel, PolicyPrior, SMALLEST};
 use crate::nn::SymlogBins;
 use crate::nn::frozen::{Feature, FrozenMlp, PANEL, Panels};
 use crate::nn::kernels::{exp, tanh};
@@ -14,6 +14,7 @@ use crate::nn::simnorm::sim_norm_panel;
 #[derive(Clone, Debug)]
 pub(crate) struct FrozenModel {
     group: usize,
+    residual: bool,
     bins: SymlogBins,
     actions: usize,
     dynamics: FrozenMlp,
@@ -28,6 +29,7 @@ impl FrozenModel {
     pub fn new(model: &ImplicitModel, policy: &PolicyPrior) -> Self {
         Self {
             group: model.config.group,
+            residual: model.config.residual,
             bins: model.bins.clone(),
             actions: policy.actions,
             dynamics: model.dynamics.frozen(0),
@@ -151,11 +153,15 @@ impl<'a> Rollout<'a> {
 
     /// One step of the latent dynamics.
     fn advance(&mut self) {
-        let FrozenModel { dynamics, group, .. } = self.model;
+        let FrozenModel { dynamics, residual, group, .. } = self.model;
         self.panels.input(self.state_action.len()).copy_from_slice(&self.state_action);
-        let next = &mut self.state_action[..self.latent];
-        next.copy_from_slice(dynamics.forward(&mut self.panels));
-        sim_norm_panel(next, *group);
+        let ahead = dynamics.forward(&mut self.panels);
+        let state = &mut self.state_action[..self.latent];
+        for (z, ahead) in state.iter_mut().zip(ahead) {
+            let before = |row: usize| if *residual { z.0[row].max(SMALLEST).ln() } else { 0.0 };
+            z.0 = std::array::from_fn(|row| before(row) + ahead.0[row]);
+        }
+        sim_norm_panel(state, *group);
     }
 
     /// Where the task has ended, more likely than not.

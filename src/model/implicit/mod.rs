@@ -10,7 +10,8 @@
 //! ```
 //!
 //! Every hidden layer has layer normalisation and Mish; latent states are simplices ([`sim_norm`]); rewards and values are
-//! two-hot regressions ([`SymlogBins`]). Deviations: no dropout in the first layer of Q (0.01 in the published code).
+//! two-hot regressions ([`SymlogBins`]). Deviations: no dropout in the first layer of Q (0.01 in the published code); the dynamics may
+//! predict changes ([`ImplicitConfig::residual`]).
 //!
 //! ```
 //! use handful::env::{Env, Task};
@@ -51,6 +52,9 @@ use crate::nn::simnorm::sim_norm;
 use crate::nn::{Activation, Grad, Mlp, SymlogBins, TapeOps, Tensor3, device, parameters_of_fields};
 use crate::rng::Rng;
 use crate::settings::{Ranges, must_hold};
+
+/// What residual latent dynamics take for numbers of a latent state below it, which could not grow again.
+const SMALLEST: f32 = 1e-6;
 
 /// Encoder, latent dynamics, reward head, an ensemble of Q functions, and the head that says when the task ends.
 #[doc(alias = "TD-MPC2")]
@@ -94,7 +98,11 @@ impl ImplicitModel {
         let (hidden, state_action) = ([units; 2], latent + spec.action_size);
         // The last layers of encoder and dynamics are normalised, too; SimNorm takes the place of their activation.
         let encoder = mlp(1, features.width(), &[config.encoder, latent], None).ending_in(Activation::Identity);
-        let dynamics = mlp(1, state_action, &[units, units, latent], None).ending_in(Activation::Identity);
+        let dynamics = if config.residual {
+            mlp(1, state_action, &hidden, Some(latent)).scale_output(0.0)
+        } else {
+            mlp(1, state_action, &[units, units, latent], None).ending_in(Activation::Identity)
+        };
         let reward = mlp(1, state_action, &hidden, Some(bins)).scale_output(0.0);
         let critics = mlp(config.critics, state_action, &hidden, Some(bins)).scale_output(0.0);
         let termination = config.terminates.then(|| mlp(1, latent, &hidden, Some(1)));
@@ -142,8 +150,16 @@ impl ImplicitModel {
     /// The latent states after actions `[1, rows, actions]` in `z`, `[1, rows, latent]`.
     pub fn next<T: Tape<f32, Cpu>>(&self, tape: &mut T, z: &Tensor3, actions: &Tensor3) -> Tensor3 {
         let inputs = tape.join(z, actions);
-        let z = self.dynamics.on(tape, &inputs, Grad::Both);
-        tape.record(&z, |z| sim_norm(z, self.config.group))
+        let ahead = self.dynamics.on(tape, &inputs, Grad::Both);
+        tape.record(&ahead, |ahead| {
+            let (ahead, tape) = ahead.split_tape();
+            let logits = if self.config.residual {
+                z.clone().put_tape(tape).clamp(SMALLEST, 1.0).ln() + ahead
+            } else {
+                ahead.put_tape(tape)
+            };
+            sim_norm(logits, self.config.group)
+        })
     }
 
     /// The predicted rewards of actions `[1, rows, actions]` in `z`: `[rows]`.

@@ -6,6 +6,10 @@ use crate::rng;
 /// Planning's fast path gives the returns of the model itself, for counts that fill no panel.
 #[test]
 fn frozen_returns_are_those_of_the_model() {
+    [false, true].into_iter().for_each(frozen_returns);
+}
+
+fn frozen_returns(residual: bool) {
     let mut env = Task::Cartpole.make();
     let config = ImplicitConfig {
         latent: 24,
@@ -15,6 +19,7 @@ fn frozen_returns_are_those_of_the_model() {
         bins: 51,
         bin_limit: 5.0,
         terminates: true,
+        residual,
         ..ImplicitConfig::default()
     };
     let mut rng = rng::stream(0, "frozen model");
