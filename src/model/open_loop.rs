@@ -81,8 +81,8 @@ pub trait OpenLoopModel {
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
 }
 
-/// Evaluates a model on held-out episodes of the environment with this `spec`, one row for each of the [`HORIZONS`] that is no longer than the longest
-/// episode; no rows without episodes.
+/// Evaluates a model on held-out episodes of the environment with this `spec`, one row for each of the [`HORIZONS`] that is no
+/// longer than the longest episode; no rows without episodes.
 #[doc(alias = "open loop")]
 pub fn open_loop(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
     let longest = episodes.iter().map(|episode| episode.actions.len()).max().unwrap_or(0);
@@ -107,6 +107,50 @@ pub fn open_loop(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], 
 /// The recorded actions of `horizon` time steps from a start, one after the other.
 pub(crate) fn actions_from<'a>((episode, t): (&'a Episode, usize), horizon: usize) -> impl Iterator<Item = f32> + 'a {
     episode.actions[t..t + horizon].iter().flatten().copied()
+}
+
+impl<M: OpenLoopModel> OpenLoopModel for &M {
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        (*self).open_loop_predictions(starts, horizon, rng)
+    }
+}
+
+/// A model whose steps are decisions of `action_repeat` time steps each, for which an action is held.
+#[derive(Clone, Copy, Debug)]
+pub struct OfDecisions<M> {
+    /// The model of decisions.
+    pub model: M,
+    /// Time steps of a decision.
+    pub action_repeat: usize,
+}
+
+impl<M: OpenLoopModel> OpenLoopModel for OfDecisions<M> {
+    /// Actions that differ within a decision are averaged, and observations within it interpolated.
+    fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
+        let repeat = self.action_repeat;
+        if repeat == 1 {
+            return self.model.open_loop_predictions(starts, horizon, rng);
+        }
+        let mean = |held: &[Vec<f32>]| -> Vec<f32> {
+            (0..held[0].len()).map(|i| held.iter().map(|a| a[i]).sum::<f32>() / held.len() as f32).collect()
+        };
+        // The decisions of each episode, one of which begins at the start.
+        let coarse = starts.iter().map(|(episode, t)| {
+            let (first, last) = (t % repeat, t + horizon);
+            let observations = episode.observations[first..=last].iter().step_by(repeat).cloned().collect();
+            let actions = episode.actions[first..last].chunks(repeat).map(mean).collect();
+            (Episode { observations, actions, ..Episode::default() }, t / repeat)
+        });
+        let coarse: Vec<(Episode, usize)> = coarse.collect();
+        let starts: Vec<(&Episode, usize)> = coarse.iter().map(|(episode, t)| (episode, *t)).collect();
+        let futures = self.model.open_loop_predictions(&starts, horizon.div_ceil(repeat), rng);
+        let at = |t: usize| -> Vec<f32> {
+            let share = (t % repeat) as f32 / repeat as f32;
+            let (before, after) = (&futures[t / repeat], &futures[t.div_ceil(repeat)]);
+            before.iter().zip(after).map(|(before, after)| before + share * (after - before)).collect()
+        };
+        (0..=horizon).map(at).collect()
+    }
 }
 
 /// An ensemble whose particles are propagated in one of several ways: that in which its agent plans.
@@ -207,6 +251,41 @@ mod tests {
                     .flat_map(move |(episode, t)| [vec![episode.observations[t + k][0]], vec![9.0; 8]].concat())
             };
             (0..=horizon).map(|k| at(k).collect()).collect()
+        }
+    }
+
+    /// Where it started, and what it was told to do: the sums of the actions.
+    struct Adds;
+
+    impl OpenLoopModel for Adds {
+        fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, _rng: &mut Rng) -> Vec<Vec<f32>> {
+            let at = |k: usize| {
+                starts
+                    .iter()
+                    .map(move |start| start.0.observations[start.1][0] + 3.0 * actions_from(*start, k).sum::<f32>())
+            };
+            (0..=horizon).map(|k| at(k).collect()).collect()
+        }
+    }
+
+    /// A model of decisions of three time steps, in each of which the sum grows by the mean of the three actions three times:
+    /// right at the end of each decision from any start, and between them where the action is held.
+    #[test]
+    fn decisions_are_predicted_from_any_start() {
+        let actions: Vec<Vec<f32>> = (0..20_u8).map(|t| vec![f32::from(t / 3)]).collect();
+        let sum = |t: usize| actions[..t].iter().map(|a| a[0]).sum::<f32>();
+        let observations = (0..=20).map(|t| vec![sum(t)]).collect();
+        let episode = Episode { observations, actions: actions.clone(), ..Episode::default() };
+        let starts = [(&episode, 3), (&episode, 7)];
+        let model = OfDecisions { model: Adds, action_repeat: 3 };
+        let futures = model.open_loop_predictions(&starts, 11, &mut rng::stream(0, "decisions"));
+        for (k, future) in futures.iter().enumerate() {
+            let expected = [sum(3 + k), sum(7 + k)];
+            assert!((future[0] - expected[0]).abs() < 1e-4, "after {k} steps {future:?}, expected {expected:?}");
+            assert!(
+                k % 3 > 0 || (future[1] - expected[1]).abs() < 1e-4,
+                "after {k} steps {future:?}, not {expected:?}"
+            );
         }
     }
 

@@ -22,6 +22,10 @@ pub struct DreamerConfig {
     pub planner: Option<PlannerConfig>,
     /// How often it replans, and how long each action is repeated.
     pub control: ControlConfig,
+    /// Time steps for which each action of the policy is held: a decision. The world model's steps, rewards (means) and discount
+    /// are of decisions.
+    #[doc(alias = "frame skip")]
+    pub action_repeat: usize,
     /// Learning rate of all networks.
     pub learning_rate: f32,
     /// Updates over which the learning rate grows to that.
@@ -57,6 +61,7 @@ impl Default for DreamerConfig {
             behaviour: ActorCriticConfig::default(),
             planner: None,
             control: ControlConfig::default(),
+            action_repeat: 1,
             learning_rate: 4e-5,
             learning_warm_up: 1000,
             batch: 16,
@@ -76,6 +81,7 @@ ranges!(DreamerConfig {
     behaviour: Nested,
     planner: Nested,
     control: Nested,
+    action_repeat: 1..=1000,
     learning_rate: 0.0..=1.0,
     learning_warm_up: 0..=1_000_000_000,
     batch: 2..=65_536,
@@ -89,7 +95,7 @@ ranges!(DreamerConfig {
 }
 require batch.is_multiple_of(PARTS) => "`batch` must be even";
 require dreams.is_none_or(|dreams| dreams <= *length) => "`dreams` must not exceed `length`";
-require warm_up > length => "`warm_up` must be more than `length`";
+require *warm_up > length * action_repeat => "`warm_up` must be more than `length` decisions";
 require replay >= length => "`replay` must hold at least `length` time steps";
 require *train_ratio <= (100 * batch * length) as f32 => "`train_ratio` must not exceed 100 times `batch` times `length`";
 require planner.as_ref().is_none_or(|planner| control.suits(planner)) =>

@@ -36,13 +36,14 @@ use policy_state::PolicyState;
 pub use returns::{ReturnScale, lambda_returns, replay_lambda_returns};
 use update::Networks;
 
+use super::decision::{Decision, Over, in_decisions};
 use super::warm_up::RandomActions;
 use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots, ValueEstimate};
-use crate::checkpoint::Weights;
+use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::WorldModel;
-use crate::model::open_loop::{OpenLoop, open_loop};
+use crate::model::open_loop::{OfDecisions, OpenLoop, open_loop};
 use crate::nn::{Adam, AdamConfig};
 use crate::replay::{Episode, SequenceReplay, Transition};
 use crate::rng::{self, Rng};
@@ -69,6 +70,7 @@ pub struct Dreamer {
     noise: RandomActions,
     /// Of the training environment.
     policy_state: PolicyState,
+    decision: Decision,
     /// Of the environments of an evaluation.
     slots: Slots<PolicyState>,
     rng: Rng,
@@ -96,17 +98,19 @@ impl Dreamer {
         let world = WorldModel::new(spec, &config.world, &mut rng);
         let (behaviour, target) = ActorCritic::new(&world, spec.action_size, &config.behaviour, &mut rng);
         let optimiser = AdamConfig { warm_up: config.learning_warm_up, ..AdamConfig::laprop(config.learning_rate) };
+        let decisions = spec.horizon.div_ceil(config.action_repeat);
         let mut agent = Self {
             spec: spec.clone(),
             policy_state: PolicyState::new(&world, &config, spec.action_size, rng::stream(seed, "dreamer mind")),
+            decision: Decision::default(),
             networks: Networks { world, behaviour, target },
             optimiser: Adam::new(optimiser),
             scale: ReturnScale::default(),
             replay: SequenceReplay::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
             update_credit: 0.0,
-            random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
-            noise: RandomActions::new(config.exploration_noise_beta, spec.horizon, spec.action_size),
+            random: RandomActions::new(config.warm_up_noise_beta, decisions, spec.action_size),
+            noise: RandomActions::new(config.exploration_noise_beta, decisions, spec.action_size),
             slots: Slots::default(),
             rng,
             config,
@@ -124,24 +128,31 @@ impl Dreamer {
     pub fn behaviour(&self) -> &ActorCritic {
         &self.networks.behaviour
     }
+
+    fn forget_episode(&mut self) {
+        self.policy_state.reset(&self.networks.world);
+        self.decision.reset();
+        self.random.reset();
+        self.noise.reset();
+    }
 }
 
 impl Agent for Dreamer {
     fn begin_episode(&mut self) {
-        self.policy_state.reset(&self.networks.world);
-        self.random.reset();
-        self.noise.reset();
+        self.forget_episode();
         self.slots.clear(0);
     }
 
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         let Self { config, networks, spec, observed, random, noise, policy_state, slots, rng, .. } = self;
         match mode {
-            Mode::Explore if *observed < config.warm_up => random.next(rng),
-            Mode::Explore => policy_state.act(networks, obs, Some(&noise.deviates(rng))),
+            Mode::Explore if *observed < config.warm_up => {
+                policy_state.held.next(config.action_repeat, || random.next(rng))
+            }
+            Mode::Explore => policy_state.act(networks, obs, || Some(noise.deviates(rng))),
             Mode::Evaluate => {
                 let fresh = |i| PolicyState::of_slot(&networks.world, config, spec.action_size, i);
-                slots.state(0, fresh).act(networks, obs, None)
+                slots.state(0, fresh).act(networks, obs, || None)
             }
         }
     }
@@ -151,7 +162,7 @@ impl Agent for Dreamer {
         let fresh = |i| PolicyState::of_slot(&networks.world, config, spec.action_size, i);
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
         let each = states.states(slots, fresh).into_par_iter().zip(observations);
-        each.map(|(state, obs)| state.act(networks, obs, None)).collect()
+        each.map(|(state, obs)| state.act(networks, obs, || None)).collect()
     }
 
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
@@ -171,12 +182,14 @@ impl Agent for Dreamer {
     }
 
     fn observe(&mut self, transition: &Transition) {
-        self.replay.push(transition);
+        match self.decision.join(transition, self.config.action_repeat) {
+            Some(Over::Whole(decision)) => self.replay.push(&decision),
+            Some(Over::Short(obs)) => self.replay.close(&obs, false),
+            None => {}
+        }
         self.observed += 1;
         if transition.terminated || transition.truncated {
-            self.policy_state.reset(&self.networks.world);
-            self.random.reset();
-            self.noise.reset();
+            self.forget_episode();
         }
     }
 
@@ -196,13 +209,15 @@ impl Agent for Dreamer {
 
 impl Diagnostics for Dreamer {
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
-        open_loop(&self.networks.world, &self.spec, episodes, &mut rng::stream(0, "open loop"))
+        let model = OfDecisions { model: &self.networks.world, action_repeat: self.config.action_repeat };
+        open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 
     fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
         let Self { networks: Networks { world, behaviour, .. }, config, spec, .. } = self;
         let discount = config.world.discount();
         let of_episode = |(i, episode): (usize, &Episode)| {
+            let episode = &in_decisions(episode, config.action_repeat);
             let mut policy_state =
                 PolicyState::new(world, config, spec.action_size, rng::stream(i as u64, "dreamer values"));
             let values = episode.observations.iter().enumerate().map(|(t, obs)| {
@@ -252,7 +267,9 @@ impl Checkpoint for Dreamer {
         state.load_module("slow", &mut self.networks.target)?;
         self.optimiser.load(state, "optimiser", &self.networks)?;
         self.replay.load(state, "replay")?;
-        self.observed = state.count("counts", 0..=self.replay.most_pushes())? as usize;
+        // Decisions that the time limit cuts short leave no trace.
+        let most = if self.config.action_repeat == 1 { self.replay.most_pushes() } else { MAX_COUNT };
+        self.observed = state.count("counts", 0..=most)? as usize;
         self.scale = ReturnScale::from_range(low, high);
         self.update_credit = update_credit;
         self.rng = own;

@@ -3,15 +3,20 @@
 use super::DreamerConfig;
 use super::planner::LatentObjective;
 use super::update::Networks;
+use crate::agent::decision::Held;
 use crate::model::{Latent, WorldModel};
 use crate::nn::tensor;
 use crate::plan::RecedingHorizon;
 use crate::rng::{self, Rng};
 
-/// The latent state of one environment, the last action taken there, and the plan that is followed, if there is a planner.
+/// The latent state of one environment, the last action taken there, which may be held, and the plan that is followed, if there is
+/// a planner.
 pub(super) struct PolicyState {
     pub latent: Latent,
     pub action: Vec<f32>,
+    /// The action that is held.
+    pub held: Held,
+    action_repeat: usize,
     control: Option<RecedingHorizon>,
     pub rng: Rng,
 }
@@ -27,13 +32,21 @@ impl PolicyState {
             .planner
             .as_ref()
             .map(|planner| RecedingHorizon::new(planner.build(actions), actions, &config.control));
-        Self { latent: world.initial(1), action: vec![0.0; actions], control, rng }
+        Self {
+            latent: world.initial(1),
+            action: vec![0.0; actions],
+            held: Held::default(),
+            action_repeat: config.action_repeat,
+            control,
+            rng,
+        }
     }
 
     /// To the state at the start of an episode.
     pub fn reset(&mut self, world: &WorldModel) {
         self.latent = world.initial(1);
         self.action.fill(0.0);
+        self.held.reset();
         if let Some(control) = &mut self.control {
             control.reset();
         }
@@ -45,9 +58,16 @@ impl PolicyState {
         self.latent = world.observe(&self.latent, &before, obs, &mut self.rng);
     }
 
-    /// Observes and acts: by the planner if there is one, else by the policy's mean, or with
-    /// `noise` at that many standard deviations from the mean.
-    pub fn act(&mut self, networks: &Networks, obs: &[f32], noise: Option<&[f32]>) -> Vec<f32> {
+    /// The next action: a new decision when the last one has been held for long enough. It is the planner's if there is one, else
+    /// the policy's mean, or so many standard deviations from the mean as the `noise` tells.
+    pub fn act(&mut self, networks: &Networks, obs: &[f32], noise: impl FnOnce() -> Option<Vec<f32>>) -> Vec<f32> {
+        let mut held = std::mem::take(&mut self.held);
+        let action = held.next(self.action_repeat, || self.decide(networks, obs, noise().as_deref()));
+        self.held = held;
+        action
+    }
+
+    fn decide(&mut self, networks: &Networks, obs: &[f32], noise: Option<&[f32]>) -> Vec<f32> {
         let Networks { world, behaviour, .. } = networks;
         self.observe(world, obs);
         let action = match &mut self.control {

@@ -53,37 +53,19 @@ impl Probe {
     }
 }
 
-/// A model that predicts observations by its probe, one for each decision of `action_repeat` time steps.
+/// A model that predicts observations by its probe.
 #[derive(Clone, Copy, Debug)]
 pub struct Probed<'a> {
     /// The model.
     pub model: &'a ImplicitModel,
     /// Its probe.
     pub probe: &'a Probe,
-    /// Time steps of a step of the model.
-    pub action_repeat: usize,
 }
 
 impl OpenLoopModel for Probed<'_> {
-    /// Actions that differ within a decision are averaged, and observations within it interpolated.
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, _rng: &mut Rng) -> Vec<Vec<f32>> {
-        let repeat = self.action_repeat;
         let obs: Vec<f32> = starts.iter().flat_map(|(episode, t)| episode.observations[*t].iter().copied()).collect();
-        let decisions = |start: &(&Episode, usize)| -> Vec<f32> {
-            let size = start.0.actions[0].len();
-            let actions: Vec<f32> = actions_from(*start, horizon).collect();
-            let each = actions.chunks(repeat * size);
-            let mean =
-                |held: &[f32], i: usize| held.iter().skip(i).step_by(size).sum::<f32>() / (held.len() / size) as f32;
-            each.flat_map(|held| (0..size).map(|i| mean(held, i)).collect::<Vec<f32>>()).collect()
-        };
-        let actions: Vec<f32> = starts.iter().flat_map(decisions).collect();
-        let futures = self.probe.rollout(self.model, &self.model.encode(&obs), &actions, horizon.div_ceil(repeat));
-        let at = |t: usize| -> Vec<f32> {
-            let share = (t % repeat) as f32 / repeat as f32;
-            let (before, after) = (&futures[t / repeat], &futures[t.div_ceil(repeat)]);
-            before.iter().zip(after).map(|(before, after)| before + share * (after - before)).collect()
-        };
-        (0..=horizon).map(at).collect()
+        let actions: Vec<f32> = starts.iter().flat_map(|start| actions_from(*start, horizon)).collect();
+        self.probe.rollout(self.model, &self.model.encode(&obs), &actions, horizon)
     }
 }
