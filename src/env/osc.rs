@@ -1,6 +1,6 @@
 //! Operational-space control (OSC): torques that make the hand behave like a critically damped spring in Cartesian space
 //! (O. Khatib, "A unified approach for motion and force control of robot manipulators: the operational space formulation",
-//! IEEE Journal of Robotics and Automation 3(1), 1987), with the gains and conventions of robosuite's OSC_POSE.
+//! IEEE Journal on Robotics and Automation 3(1), 1987), with the gains and conventions of robosuite's OSC_POSE.
 //!
 //! The torques come without the part that carries the arm's weight, since the physics switches
 //! gravity off for the arm; that part still counts towards the torque limits, as in robosuite.
@@ -92,7 +92,7 @@ impl<S: RealField + Copy> OperationalSpaceController<S> {
         motor - at.gravity
     }
 
-    /// The operational-space torque (Khatib 1987, Eqs. 28, 51 and 52), before Coriolis forces and gravity:
+    /// The operational-space torque (Khatib 1987, Eqs. 28, 51, 52 and 55), before Coriolis forces and gravity:
     ///
     /// tau = Jp' Lp Fp + Jr' Lr Fr + (I - J' L J M^-1) M a0
     ///

@@ -64,8 +64,9 @@ pub fn coverage(forecasts: &[GaussianForecast], level: f64) -> f64 {
     inside as f64 / forecasts.len() as f64
 }
 
-/// Expected calibration error of regression (Kuleshov et al. 2018): over the levels 0.1, 0.2, ... 0.9 the mean absolute
-/// difference between a level and the fraction of outcomes whose [PIT](GaussianForecast::pit) is at most that level.
+/// Expected calibration error of regression (after Kuleshov et al. 2018, who sum squared differences): over the levels 0.1,
+/// 0.2, ... 0.9 the mean absolute difference between a level and the fraction of outcomes whose
+/// [PIT](GaussianForecast::pit) is at most that level.
 #[doc(alias = "ECE")]
 pub fn expected_calibration_error(forecasts: &[GaussianForecast]) -> f64 {
     let pit: Vec<f64> = forecasts.iter().map(GaussianForecast::pit).collect();

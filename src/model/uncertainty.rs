@@ -55,7 +55,7 @@ pub fn max_pairwise_distance(means: &[Vec<f64>]) -> f64 {
 }
 
 /// Largest Euclidean norm of a member's standard deviations (variances are `[members][features]`): the uncertainty penalty
-/// of MOPO (Yu et al. 2020). Mostly aleatoric, and yet large where data are few.
+/// of MOPO (Yu et al. 2020), as its authors' code has it. Mostly aleatoric, and yet large where data are few.
 #[doc(alias = "MOPO")]
 pub fn max_std_norm(variances: &[Vec<f64>]) -> f64 {
     variances.iter().map(|v| v.iter().sum::<f64>().sqrt()).fold(0.0, f64::max)

@@ -1,5 +1,5 @@
 //! Adam (Kingma & Ba 2015, Algorithm 1), with gradient clipping and decoupled weight decay (AdamW); and LaProp (Ziyin et
-//! al. 2020, Algorithm 1), which normalises the gradient before it enters the first moment.
+//! al. 2020), which normalises the gradient before it enters the first moment.
 
 use std::collections::BTreeMap;
 use std::ops::{AddAssign, Mul, Sub};
@@ -258,7 +258,7 @@ vectorised_fn! {
 }
 
 vectorised_fn! {
-    /// LaProp (Ziyin et al. 2020, Algorithm 1): m averages g / (sqrt(v_hat) + epsilon), and p <- p - decay p - rate m_hat.
+    /// LaProp (Ziyin et al. 2020): m averages g / (sqrt(v_hat) + epsilon), and p <- p - decay p - rate m_hat.
     fn update_normalised(
         parameter: &'a mut [f32],
         gradient: &'a [f32],

@@ -126,8 +126,8 @@ impl Categorical {
     ///
     /// *KL balancing* splits one KL divergence into two losses of the same value, each with a stop-gradient sg(.) on one
     /// side, so that the prior can be pulled towards the posterior harder than the posterior towards the prior (Hafner et
-    /// al. 2023, arXiv v1, eq. 5; weights 1 and 0.1 in the published code). *Free nats* (free bits): a KL, summed over the
-    /// variables of a row, below `free_nats` counts as that much and has no gradient.
+    /// al. 2023, arXiv v1, eq. 5; with weights 0.5 and 0.1 there, 1 and 0.1 in the published code). *Free nats* (free bits): a
+    /// KL, summed over the variables of a row, below `free_nats` counts as that much and has no gradient.
     #[doc(alias = "KL balancing")]
     #[doc(alias = "stop-gradient")]
     #[doc(alias = "free bits")]

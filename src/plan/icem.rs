@@ -6,7 +6,8 @@
 //!
 //! Deviations: kept elites are evaluated again with the other candidates, since the return that a stochastic model
 //! predicted for them may have been a favourable draw; a shifted elite repeats its last action instead of drawing a new
-//! one; `execute_mean` executes the mean, as PETS does.
+//! one; the momentum averages variances, as in CEM, where the authors' code averages standard deviations; the mean comes on
+//! top of the samples, where it takes the place of one; `execute_mean` executes the mean, as PETS does.
 
 use serde::{Deserialize, Serialize};
 

@@ -4,7 +4,8 @@
 //!
 //! Deviations: several iterations for each plan; the temperature is relative to the standard deviation of the returns;
 //! MPPI's term for the control cost of the noise is left out, as in PDDM; and the filter runs over mean plus noise,
-//! starting from the action executed last, as in the PDDM authors' code (the paper filters the noise alone).
+//! starting from the action executed last, as in the PDDM authors' code (the paper filters the noise alone), and is clipped to
+//! the bounds at each step (in their code, at the end).
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,4 @@
-//! Coloured noise (Timmer and Koenig 1995; for planning, Pinneri et al. 2020, section 3.1): random sequences whose power
+//! Coloured noise (Timmer and Koenig 1995; for planning, Pinneri et al. 2020): random sequences whose power
 //! spectral density falls with frequency f as f^-beta. Beta 0 is white noise, 1 pink, 2 red (Brownian); the larger beta,
 //! the more successive actions agree, and the further an arm gets with them.
 //!

@@ -1,7 +1,8 @@
 //! Actor and critic of DreamerV3, which learn from rollouts imagined in the world model: the critic by two-hot symexp
 //! regression on lambda-returns, the actor by REINFORCE with an entropy bonus.
 //!
-//! Equation numbers are those of Hafner et al. 2023, arXiv v1.
+//! Equation numbers are those of Hafner et al. 2023, arXiv v1. There the actor of continuous actions learned by backpropagation
+//! through the world model; REINFORCE for all actions is that of arXiv v2 and of the published code since then.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -54,7 +55,7 @@ pub struct ImaginedRollout {
 /// The losses of actor and critic on an [`ImaginedRollout`], `[1, rows, 1]` for each of its H time steps.
 #[derive(Clone, Debug)]
 pub struct ActorCriticLoss {
-    /// REINFORCE with entropy bonus, eq. 11.
+    /// REINFORCE with entropy bonus.
     pub policy: Vec<Tensor3>,
     /// Two-hot cross-entropy of the lambda-return and of the target network's value.
     pub critic: Vec<Tensor3>,
@@ -184,7 +185,7 @@ impl ActorCritic {
         ActorCriticLoss { policy: policy_losses, critic: critic_losses, report }
     }
 
-    /// The actor's loss in one state, eq. 11, by REINFORCE with the critic as baseline:
+    /// The actor's loss in one state: the objective of eq. 11, by REINFORCE with the critic as baseline (as in arXiv v2):
     ///
     /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)])`
     ///

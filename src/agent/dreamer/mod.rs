@@ -3,9 +3,11 @@
 //! actions are planned.
 //!
 //! [`Dreamer`] wires the parts: the world model is in [`crate::model`], actor and critic are in [`ActorCritic`], planners in
-//! [`crate::plan`], one update in `update.rs`. Losses, networks and constants are those of the published code. Deviations:
-//! replayed sequences start with a latent state of zeros, new experience has no precedence in the replay buffer, positions
-//! are seen as differences (`model/features/latent.rs`), and in evaluation the policy acts by its mean.
+//! [`crate::plan`], one update in `update.rs`. Losses, networks and constants are those of the published code, in its newest
+//! version. Deviations: there is one environment, the first actions are random (`warm_up`), the replay buffer is smaller, its
+//! sequences start with a latent state of zeros, new experience has no precedence in it, positions are seen as differences
+//! (`model/features/latent.rs`), and in evaluation the policy acts by its mean. Optional: rollouts from a part of the states
+//! (`dreams`), exploration with coloured noise. PlaNet has Gaussian states and the KL divergence in its loss once.
 //!
 //! ```
 //! use handful::agent::dreamer::DreamerConfig;

@@ -1,4 +1,4 @@
-//! Planning in the latent space of the world model, as PlaNet does (Hafner et al. 2019, algorithm 2): a planner evaluates
+//! Planning in the latent space of the world model, as PlaNet does (Hafner et al. 2019, Algorithm 2): a planner evaluates
 //! action sequences by imagining them, instead of asking the policy.
 
 use super::actor_critic::ActorCritic;

@@ -10,6 +10,9 @@ use crate::replay::SequenceBatch;
 ///
 /// `R_t = r_{t+1} + c_{t+1} ((1 - lambda) v_{t+1} + lambda R_{t+1})`, and at the horizon `R_H = v_H`.
 ///
+/// Indices are those of the published code, where a reward belongs to the state that it was received on arriving in; the paper
+/// writes r_t and gamma c_t for our r_{t+1} and c_{t+1}.
+///
 /// `rewards`, `continuations` and `values` hold a list `[rows]` for each of H + 1 time steps, the start first: a reward is for
 /// arriving at its time step, a continuation is the probability that the episode continues there, times the discount. The
 /// result has H lists.

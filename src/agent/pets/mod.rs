@@ -15,8 +15,9 @@
 //! This module wires them together: the ensemble and its imagination are in [`crate::model`], the search is in
 //! [`crate::plan`].
 //!
-//! Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; risk
-//! measures other than the mean, and a penalty or a bonus for disagreement, are optional.
+//! Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
+//! actions at the beginning are coloured noise; those of the [ensemble](crate::model::ensemble). Risk measures other than the
+//! mean, a penalty or a bonus for disagreement, a reward for a plan's last state, and a learned reward are optional.
 
 mod checkpoint;
 mod config;

@@ -2,7 +2,7 @@
 
 use crate::replay::Batch;
 
-/// The soft Bellman backup (equations 2 and 3), `[batch]`:
+/// The soft Bellman backup (Haarnoja et al. 2018, equations 2 and 3; there n is 1 and there are no ends), `[batch]`:
 ///
 /// ```text
 /// y = r + gamma^n (1 - terminated) (min Q(s', a') - alpha log pi(a'|s'))

@@ -1,5 +1,5 @@
 //! Soft actor-critic (SAC) with automatic temperature (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and
-//! Applications", Algorithm 1; equation numbers below are that paper's). The model-free baseline.
+//! Applications", arXiv:1812.05905, Algorithm 1; equation numbers below are that paper's). The model-free baseline.
 //!
 //! One update: [`Sac::learn`] samples a minibatch from the replay buffer, moves the critics towards the soft Bellman
 //! target, the policy up the critics' values and its entropy, the temperature towards the target entropy, and the target
@@ -9,7 +9,8 @@
 //! -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
 //! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; truncated episodes
 //! are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the mean of the critics for the policy
-//! where we take the smallest); goals may be relabelled in hindsight; the policy may explore with coloured noise.
+//! where we take the smallest); goals may be relabelled in hindsight; the policy may explore with coloured noise, and may be
+//! updated less often than the critics; an action may be held for several time steps; gradients may be clipped.
 
 mod acting;
 mod backup;

@@ -8,7 +8,8 @@ use crate::plan::GuidedConfig;
 use crate::settings::{fits, ranges};
 
 /// Settings of [`TdMpc2`](super::TdMpc2). [`Preset`](crate::agent::Preset) has tuned ones. The defaults are the published
-/// constants, but for a smaller batch and smaller networks.
+/// constants, but for a smaller batch (256), smaller networks, two critics (5), and a warm-up of 1000 steps (there five episodes,
+/// if that is more).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TdMpc2Config {

@@ -13,7 +13,9 @@
 //!
 //! The model is in [`crate::model::implicit`], the planner in [`crate::plan`]; an update is in `update.rs`. Deviations: no
 //! dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
-//! observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; sizes for two cores.
+//! observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
+//! action are averaged, not summed; sizes for two cores. Optional: n-step targets, coloured noise for exploration, executing the
+//! mean of a plan.
 
 mod checkpoint;
 mod config;

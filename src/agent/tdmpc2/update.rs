@@ -99,7 +99,7 @@ impl Networks {
     /// The policy's loss on latent states `z` (`[1, (H + 1) x sequences, latent]`, step after step):
     ///
     /// ```text
-    /// L = 1/(H+1) sum_t decay^t [ -(Q_i + Q_j)(z_t, a_t) / 2 S - entropy x bonus ],   a_t ~ p(z_t)
+    /// L = 1/(H+1) sum_t decay^t [ -(Q_i + Q_j)(z_t, a_t) / (2 S) - entropy x bonus ],   a_t ~ p(z_t)
     /// ```
     ///
     /// with two of the critics; S is the running scale of the values at the first step, which takes them in first. Gradients

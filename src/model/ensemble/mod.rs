@@ -12,6 +12,11 @@
 //!   member has its own.
 //! - Early stopping keeps the best weights of each member separately, whatever the margin (mbrl-lib asks for 1 % of any
 //!   member); weight decay is decoupled (AdamW).
+//! - All members train on the same transitions, each in its own order, unless [`EnsembleConfig::bootstrap`] is set (PETS draws
+//!   a bootstrap sample for each).
+//! - The loss is the beta-NLL; with [`EnsembleConfig::beta`] 0 it is that of PETS. Targets far from the mean are clipped.
+//! - The length of a fit is a number of gradient steps, not of epochs, and the members that predict are the best on the
+//!   validation set ([`EnsembleConfig::elites`], as in mbrl-lib).
 //! - A share of the transitions is held out from all fits, as validation set (PETS holds none out).
 //! - Predicted standard deviations are calibrated by a temperature on the validation set.
 //!

@@ -60,6 +60,8 @@ impl ImplicitModel {
     /// L = 1/H sum_t decay^t [ 20 |z_t+1 - sg(h(o_t+1))|^2 / D + 0.1 CE(R(z_t, a_t), r_t) + 0.1 CE(Q_i(z_t, a_t), y_t) ]
     /// ```
     ///
+    /// averaged over the critics Q_i, with the default weights; the cross-entropy of the task's ends, if learned, is added.
+    ///
     /// `encoded` are the latent states of the last H observations, sg(h(o_t+1)), `[1, H x sequences, latent]`, and `targets` the
     /// value targets y_t, `[H x sequences]`. Gradients flow through the whole rollout.
     pub fn loss<T: Tape<f32, Cpu>>(

@@ -79,7 +79,8 @@ fn squashed<T: Tape<f32, Cpu>>(head: Tensor3<T>, noise: &[f32]) -> Tensor3<T> {
 }
 
 /// The entropy bonus of actions with this noise, `[1, rows, 1]`: minus the log-density of `m + std noise` before the tanh, times
-/// the number of actions, as in the published code (without the tanh's correction, whose gradient cancels there).
+/// the number of actions, as in the newest published code (without the tanh's correction, whose gradient cancels there). The code
+/// of 2023, which the paper's results are from, had the correction in its bonus.
 fn entropy_bonus<T: Tape<f32, Cpu>>(tape: &mut T, head: &Tensor3, noise: &[f32]) -> Tensor3 {
     let actions = head.shape().2 / 2;
     let half_log_tau = 0.5 * std::f32::consts::TAU.ln();

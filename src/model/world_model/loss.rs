@@ -11,12 +11,14 @@ use crate::nn::{Adam, Grad, TapeOps, Tensor3, tensor};
 use crate::replay::SequenceBatch;
 use crate::rng::Rng;
 
-/// The loss of a [`WorldModel`] on a batch of sequences, term by term (Hafner et al. 2023, arXiv v1, eq. 4 and 5).
+/// The loss of a [`WorldModel`] on a batch of sequences, term by term (Hafner et al. 2023, arXiv v1, eq. 4 and 5). As in the
+/// published code, it is a mean over time steps, where eq. 4 has their sum.
 ///
 /// Each term is `[1, length x sequences, 1]`: its value at each time step, rows as in [`SequenceBatch`], not yet weighted.
 #[derive(Clone, Debug)]
 pub struct WorldModelLoss {
-    /// The squared error of the decoded observation, summed over its numbers, in the networks' units (symlog and scaled).
+    /// The squared error of the decoded observation, summed over its numbers, in the networks' units (symlog and scaled);
+    /// without the factor 1/2 of eq. 1, as in the published code.
     pub reconstruction: Tensor3,
     /// The cross-entropy of the reward's two-hot distribution. At the first time step of an episode its target is 0, as in
     /// the published code, although a sequence that begins within an episode starts from the same blank state with a reward.
