@@ -54,15 +54,23 @@ pub struct ImaginedRollout {
     pub weights: Vec<Vec<f32>>,
 }
 
-/// The losses of actor and critic on an [`ImaginedRollout`], `[1, H x rows, 1]`, one time step below the other.
+/// The losses of actor and critic on an [`ImaginedRollout`], `[1, rows, 1]` for each of its H time steps.
 #[derive(Clone, Debug)]
 pub struct ActorCriticLoss {
     /// REINFORCE with entropy bonus.
-    pub policy: Tensor3,
+    pub policy: Vec<Tensor3>,
     /// Two-hot cross-entropy of the lambda-return and of the target network's value.
-    pub critic: Tensor3,
+    pub critic: Vec<Tensor3>,
     /// Means, for the log.
     pub report: Losses,
+}
+
+impl ActorCriticLoss {
+    /// The losses with their weights, both averaged over time: what [`ops::total`] sums up.
+    pub fn weighted(&self) -> Vec<(f32, Tensor3)> {
+        let both = self.policy.iter().chain(&self.critic);
+        both.map(|loss| (1.0 / self.policy.len() as f32, loss.clone())).collect()
+    }
 }
 
 impl ActorCritic {
@@ -179,6 +187,9 @@ impl ActorCritic {
             ("advantage_magnitude", advantages.iter().map(|a| a.abs()).sum::<f32>() / advantages.len() as f32),
             ("imagined_value", mean(&rollout.values[0])),
         ]);
+        let rows = weights.len() / horizon;
+        let [policy, critic] =
+            [policy, critic].map(|losses| (0..horizon).map(|t| tape.rows(&losses, t * rows, rows)).collect());
         ActorCriticLoss { policy, critic, report }
     }
 

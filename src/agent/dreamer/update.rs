@@ -104,12 +104,13 @@ impl Networks {
         let Self { world, behaviour, target } = self;
         // A tape that adds to the gradients that are there already.
         let (_, mut tape) = rollout.features[0].clone().traced(gradients).split_tape();
-        let loss = behaviour.loss(&mut tape, world, target, &rollout, scale);
-        losses.extend(loss.report);
+        let mut loss = behaviour.loss(&mut tape, world, target, &rollout, scale);
+        losses.extend(std::mem::take(&mut loss.report));
         let gradients = match behaviour.config.gradient {
-            ActorGradient::Reinforce => ops::total(tape, &[(1.0, loss.policy), (1.0, loss.critic)]).backward(),
+            ActorGradient::Reinforce => ops::total(tape, &loss.weighted()).backward(),
             ActorGradient::Dynamics => {
-                let mut gradients = ops::total(tape, &[(1.0, loss.critic)]).backward();
+                let of_critic = loss.critic.iter().map(|each| (1.0 / loss.critic.len() as f32, each.clone()));
+                let mut gradients = ops::total(tape, &of_critic.collect::<Vec<_>>()).backward();
                 let mut tape = OwnedTape::default();
                 let terms = behaviour.dynamics_loss(&mut tape, world, &start, &rollout, scale, &mut rng);
                 losses.insert("policy_loss", terms.iter().map(|(weight, term)| weight * ops::mean(term)).sum());
