@@ -228,7 +228,7 @@ impl Rssm {
     fn sequence_model<T: Tape<f32, Cpu>>(&self, tape: &mut T, before: &Latent, action: &Tensor3) -> Tensor3 {
         let deter = self.deter_in.on(tape, &before.deter, Grad::Both);
         let stoch = self.stoch_in.on(tape, &before.stoch, Grad::Both);
-        let action = self.action_in.on(tape, action, Grad::Params);
+        let action = self.action_in.on(tape, action, Grad::Both);
         let inputs = tape.join(&deter, &stoch);
         let inputs = tape.join(&inputs, &action);
         let hidden = self.hidden.on(tape, &before.deter, Some(&inputs));

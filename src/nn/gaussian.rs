@@ -88,6 +88,11 @@ impl BoundedNormal {
         -0.5 * (z * z + (2.0 * std::f32::consts::PI).ln()) - self.std.ln()
     }
 
+    /// The derivatives of mean and standard deviation with respect to their raw numbers.
+    pub fn derivatives(&self) -> [f32; 2] {
+        self.slopes
+    }
+
     /// Entropy, in nats.
     pub fn entropy(&self) -> f32 {
         0.5 * (1.0 + (2.0 * std::f32::consts::PI).ln()) + self.std.ln()

@@ -88,6 +88,17 @@ impl SymexpBins {
         probabilities.chunks_exact(self.bins.len()).map(|row| self.expected(row)).collect()
     }
 
+    /// [`SymexpBins::decode`] with a gradient: `[1, batch, 1]`.
+    pub fn decode_on<T: Tape<f32, Cpu>>(&self, tape: &mut T, logits: &Tensor3) -> Tensor3 {
+        tape.rowwise(logits, |_, logits, slope| {
+            slope.copy_from_slice(logits);
+            softmax(slope, self.bins.len());
+            let expected = self.expected(slope);
+            slope.iter_mut().zip(&self.bins).for_each(|(p, bin)| *p *= bin - expected);
+            expected
+        })
+    }
+
     /// The cross-entropy between each row of logits `[1, batch, bins]` and the two-hot codes of its targets, summed over the
     /// lists of targets, `[batch]` each: `[1, batch, 1]`.
     ///
@@ -173,6 +184,25 @@ mod tests {
         near("decode", bins.decode(&logits)[0], 0.775_887_2, 1e-4);
         for (y, loss) in [(1.5, 2.463_815_85), (0.0, 2.517_550_82), (-0.02, 2.563_152_85)] {
             near("loss", values(&bins.loss(&mut NoneTape, &logits, &[&[y]]))[0], loss, 1e-5);
+        }
+    }
+    #[test]
+    fn predictions_have_the_slopes_of_differences() {
+        let (cpu, bins) = (device(), SymexpBins::new(9, 2.0));
+        let numbers = [0.3, -1.0, 0.5, 0.2, 0.0, 1.1, -0.4, 0.9, 0.1];
+        let logits = tensor(&cpu, numbers.to_vec(), (1, 1, 9));
+        let mut tape = OwnedTape::default();
+        let decoded = bins.decode_on(&mut tape, &logits);
+        assert_eq!(values(&decoded), bins.decode(&logits));
+        let mut gradients = crate::nn::ops::total(tape, &[(1.0, decoded)]).backward();
+        let slopes = gradients.get_or_alloc_mut(&logits).expect("memory");
+        for (i, slope) in slopes.iter().enumerate() {
+            let moved = |by: f32| {
+                let mut numbers = numbers;
+                numbers[i] += by;
+                bins.decode(&tensor(&cpu, numbers.to_vec(), (1, 1, 9)))[0]
+            };
+            near("slope", *slope, f64::from((moved(1e-2) - moved(-1e-2)) / 2e-2), 1e-3);
         }
     }
 }

@@ -178,7 +178,10 @@ mod tests {
     fn a_type_tells_where_it_has_a_choice() {
         let of_pets = ["pets.planner", "pets.control.interpolation", "pets.propagation", "pets.risk"];
         assert_eq!(choices::<PetsConfig>("pets"), of_pets);
-        assert_eq!(choices::<DreamerConfig>("dreamer"), ["dreamer.planner", "dreamer.control.interpolation"]);
+        assert_eq!(
+            choices::<DreamerConfig>("dreamer"),
+            ["dreamer.behaviour.gradient", "dreamer.planner", "dreamer.control.interpolation"]
+        );
         assert!(choices::<SacConfig>("sac").is_empty());
     }
 }

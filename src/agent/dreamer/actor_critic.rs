@@ -20,10 +20,10 @@ use crate::rng::{self, Rng};
 /// The actor (a policy over the features of latent states) and the critic (a two-hot distribution of returns).
 #[derive(Clone, Debug)]
 pub struct ActorCritic {
-    config: ActorCriticConfig,
-    actions: usize,
-    policy: Mlp,
-    critic: Mlp,
+    pub(super) config: ActorCriticConfig,
+    pub(super) actions: usize,
+    pub(super) policy: Mlp,
+    pub(super) critic: Mlp,
 }
 
 parameters_of_fields!(ActorCritic: policy, critic);
@@ -43,6 +43,8 @@ pub struct ImaginedRollout {
     pub features: Vec<Tensor3>,
     /// The actions drawn from the policy, `[rows, actions]` each, H of them; not clipped to [-1, 1].
     pub actions: Vec<Vec<f32>>,
+    /// The predicted continuations times discount, `[rows]` each, H + 1 of them.
+    pub continuations: Vec<Vec<f32>>,
     /// The critic's values, `[rows]` each, H + 1 of them.
     pub values: Vec<Vec<f32>>,
     /// [Lambda-returns](lambda_returns), `[rows]` each, H of them.
@@ -66,9 +68,8 @@ pub struct ActorCriticLoss {
 impl ActorCriticLoss {
     /// The losses with their weights, both averaged over time: what [`ops::total`] sums up.
     pub fn weighted(&self) -> Vec<(f32, Tensor3)> {
-        let each = 1.0 / self.policy.len() as f32;
-        let pairs = self.policy.iter().zip(&self.critic);
-        pairs.flat_map(|(policy, critic)| [(each, policy.clone()), (each, critic.clone())]).collect()
+        let both = self.policy.iter().chain(&self.critic);
+        both.map(|loss| (1.0 / self.policy.len() as f32, loss.clone())).collect()
     }
 }
 
@@ -93,7 +94,7 @@ impl ActorCritic {
         polyak(target, &self.critic, self.config.slow_rate);
     }
 
-    fn distribution(&self, head: &[f32], i: usize) -> BoundedNormal {
+    pub(super) fn distribution(&self, head: &[f32], i: usize) -> BoundedNormal {
         BoundedNormal::new(head[i], head[self.actions + i], self.config.min_std)
     }
 
@@ -129,9 +130,12 @@ impl ActorCritic {
             features.push(latent.features());
             actions.push(drawn);
         }
-        let rewards: Vec<_> = features.iter().map(|features| world.rewards(features)).collect();
-        let continuations: Vec<_> = features.iter().map(|features| world.continuations(features)).collect();
-        let values: Vec<_> = features.iter().map(|features| self.values(world, features)).collect();
+        // One product for all time steps is faster than one for each.
+        let all = NoneTape.stack(&features);
+        let by_time =
+            |numbers: Vec<f32>| -> Vec<Vec<f32>> { numbers.chunks_exact(rows).map(<[f32]>::to_vec).collect() };
+        let [rewards, continuations, values] =
+            [world.rewards(&all), world.continuations(&all), self.values(world, &all)].map(by_time);
         let mut weight = vec![1.0; rows];
         let mut weights = Vec::with_capacity(horizon);
         for continuations in &continuations[..horizon] {
@@ -139,7 +143,7 @@ impl ActorCritic {
             weights.push(weight.clone());
         }
         let returns = lambda_returns(&rewards, &continuations, &values, self.config.lambda);
-        ImaginedRollout { features, actions, values, returns, weights }
+        ImaginedRollout { features, actions, continuations, values, returns, weights }
     }
 
     /// The losses of actor and critic on an imagined rollout, recorded on `tape`. Advantages are divided by `scale`, the
@@ -152,37 +156,41 @@ impl ActorCritic {
         rollout: &ImaginedRollout,
         scale: f32,
     ) -> ActorCriticLoss {
-        let share = 1.0 / self.config.horizon as f32;
-        let (mut policy_losses, mut critic_losses) = (Vec::new(), Vec::new());
-        let [mut policy_loss, mut critic_loss, mut policy_entropy, mut advantage_magnitude] = [0.0; 4];
-        for t in 0..rollout.actions.len() {
-            let (features, weights) = (&rollout.features[t], &rollout.weights[t]);
-            let (actions, returns) = (&rollout.actions[t], &rollout.returns[t]);
-            // (R_t - v_t) / S.
-            let advantages: Vec<f32> = returns.iter().zip(&rollout.values[t]).map(|(r, v)| (r - v) / scale).collect();
-            let head = self.policy.on(tape, features, Grad::Params);
-            let policy = tape.rowwise(&head, |row, head, slope| {
-                let actions = &actions[row * self.actions..][..self.actions];
-                let (loss, entropy) = self.reinforce(head, actions, weights[row], advantages[row], slope);
-                policy_entropy += share * entropy / weights.len() as f32;
-                loss
-            });
-            let target_values = world.bins().decode(&target.forward(features.clone(), Grad::Input));
-            let critic = self.critic_loss(tape, world, features, Grad::Params, [returns, &target_values], weights);
-            advantage_magnitude += share * advantages.iter().map(|a| a.abs()).sum::<f32>() / advantages.len() as f32;
-            policy_loss += share * ops::mean(&policy);
-            critic_loss += share * ops::mean(&critic);
-            policy_losses.push(policy);
-            critic_losses.push(critic);
+        let horizon = rollout.actions.len();
+        // One time step below the other.
+        let features = NoneTape.stack(&rollout.features[..horizon]);
+        let [returns, values, weights] =
+            [&rollout.returns, &rollout.values, &rollout.weights].map(|each| each[..horizon].concat());
+        let actions = rollout.actions.concat();
+        let mean = |numbers: &[f32]| numbers.iter().sum::<f32>() / numbers.len() as f32;
+        // (R_t - v_t) / S.
+        let mut advantages: Vec<f32> = returns.iter().zip(&values).map(|(r, v)| (r - v) / scale).collect();
+        let advantage_mean = mean(&advantages);
+        if self.config.center_advantages {
+            advantages.iter_mut().for_each(|advantage| *advantage -= advantage_mean);
         }
+
+        let head = self.policy.on(tape, &features, Grad::Params);
+        let mut entropies = Vec::with_capacity(weights.len());
+        let policy = tape.rowwise(&head, |row, head, slope| {
+            let actions = &actions[row * self.actions..][..self.actions];
+            let (loss, entropy) = self.reinforce(head, actions, weights[row], advantages[row], slope);
+            entropies.push(entropy);
+            loss
+        });
+        let target_values = world.bins().decode(&target.forward(features.clone(), Grad::Input));
+        let critic = self.critic_loss(tape, world, &features, Grad::Params, [&returns, &target_values], &weights);
         let report = Losses::from([
-            ("policy_loss", policy_loss),
-            ("critic_loss", critic_loss),
-            ("policy_entropy", policy_entropy),
-            ("advantage_magnitude", advantage_magnitude),
-            ("imagined_value", rollout.values[0].iter().sum::<f32>() / rollout.values[0].len() as f32),
+            ("policy_loss", ops::mean(&policy)),
+            ("critic_loss", ops::mean(&critic)),
+            ("policy_entropy", mean(&entropies)),
+            ("advantage_magnitude", advantages.iter().map(|a| a.abs()).sum::<f32>() / advantages.len() as f32),
+            ("imagined_value", mean(&rollout.values[0])),
         ]);
-        ActorCriticLoss { policy: policy_losses, critic: critic_losses, report }
+        let rows = weights.len() / horizon;
+        let [policy, critic] =
+            [policy, critic].map(|losses| (0..horizon).map(|t| tape.rows(&losses, t * rows, rows)).collect());
+        ActorCriticLoss { policy, critic, report }
     }
 
     /// The actor's loss in one state: the objective of eq. 11, by REINFORCE with the critic as baseline (as in arXiv v2):

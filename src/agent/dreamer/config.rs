@@ -44,6 +44,8 @@ pub struct DreamerConfig {
     pub train_ratio: f32,
     /// Steps of random actions before the first update.
     pub warm_up: usize,
+    /// Whether the steps of the warm-up owe updates by the replay ratio, too; all of them are made at its end.
+    pub warm_up_updates: bool,
     /// Exponent beta of the coloured noise that random actions are made of: 0 is white.
     pub warm_up_noise_beta: f64,
     /// Exponent beta of the coloured noise by which actions are drawn from the policy while it explores: 0 is white, as in
@@ -69,6 +71,7 @@ impl Default for DreamerConfig {
             dreams: None,
             train_ratio: 1024.0,
             warm_up: 1024,
+            warm_up_updates: false,
             warm_up_noise_beta: 0.0,
             exploration_noise_beta: 0.0,
             replay: 1_000_000,
@@ -89,6 +92,7 @@ ranges!(DreamerConfig {
     dreams: 2..=10_000,
     train_ratio: 1e-6..=1e6,
     warm_up: 3..=1_000_000_000,
+    warm_up_updates: Any,
     warm_up_noise_beta: 0.0..=10.0,
     exploration_noise_beta: 0.0..=10.0,
     replay: 2..=100_000_000,
@@ -109,6 +113,17 @@ require fits(&[*batch, dreams.unwrap_or(*length), behaviour.horizon, world.wides
     "`batch` times `dreams` times `behaviour.horizon` times the widest layer does not fit into memory";
 );
 
+/// How the actor learns from imagined rollouts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ActorGradient {
+    /// Actions become likelier by their advantages, as in the published code.
+    #[default]
+    Reinforce,
+    /// Returns are differentiated with respect to actions, through the learned dynamics, as in DreamerV1 and V2.
+    Dynamics,
+}
+
 /// Settings of an [`super::ActorCritic`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -123,6 +138,11 @@ pub struct ActorCriticConfig {
     pub lambda: f32,
     /// Coefficient of the policy's entropy bonus, per nat, in units of the return scale.
     pub entropy: f32,
+    /// How the actor learns.
+    pub gradient: ActorGradient,
+    /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic is
+    /// behind, almost every advantage is positive, and any action becomes likelier.
+    pub center_advantages: bool,
     /// The smallest standard deviation of the policy.
     pub min_std: f32,
     /// Rate of the target network's exponential moving average, per update.
@@ -140,6 +160,8 @@ impl Default for ActorCriticConfig {
             horizon: 15,
             lambda: 0.95,
             entropy: 3e-4,
+            gradient: ActorGradient::default(),
+            center_advantages: false,
             min_std: 0.1,
             slow_rate: 0.02,
             replayed: 0.3,
@@ -153,6 +175,8 @@ ranges!(ActorCriticConfig {
     horizon: 1..=1000,
     lambda: 0.0..=1.0,
     entropy: 0.0..=1e3,
+    gradient: Any,
+    center_advantages: Any,
     min_std: 1e-4..=0.999,
     slow_rate: 0.0..=1.0,
     replayed: 0.0..=1e3,

@@ -24,6 +24,7 @@
 
 mod actor_critic;
 mod config;
+mod dynamics_gradient;
 mod planner;
 mod policy_state;
 mod returns;
@@ -32,7 +33,7 @@ mod update;
 use rayon::prelude::*;
 
 pub use actor_critic::{ActorCritic, ActorCriticLoss, ImaginedRollout, TargetCritic};
-pub use config::{ActorCriticConfig, DreamerConfig};
+pub use config::{ActorCriticConfig, ActorGradient, DreamerConfig};
 pub use planner::LatentObjective;
 use policy_state::PolicyState;
 pub use returns::{ReturnScale, lambda_returns, replay_lambda_returns};
@@ -199,7 +200,9 @@ impl Agent for Dreamer {
         if self.observed < self.config.warm_up {
             return None;
         }
-        self.update_credit += self.config.train_ratio / (self.config.batch * self.config.length) as f32;
+        let DreamerConfig { batch, length, train_ratio, warm_up, warm_up_updates, .. } = self.config;
+        let paid_now = if warm_up_updates && self.observed == warm_up { warm_up } else { 1 };
+        self.update_credit += paid_now as f32 * train_ratio / (batch * length) as f32;
         let mut losses = None;
         while self.update_credit >= 1.0 {
             self.update_credit -= 1.0;
@@ -281,3 +284,6 @@ impl Checkpoint for Dreamer {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -6,10 +6,10 @@ use dfdx::tensor::{Cpu, Gradients};
 use rayon::prelude::*;
 
 use super::actor_critic::{ActorCritic, ImaginedRollout, TargetCritic};
-use super::config::PARTS;
+use super::config::{ActorGradient, PARTS};
 use super::{Dreamer, DreamerConfig};
 use crate::agent::Losses;
-use crate::model::WorldModel;
+use crate::model::{Latent, WorldModel};
 use crate::nn::{Parameters, TapeOps, ops, parameters_of_fields};
 use crate::replay::SequenceBatch;
 use crate::rng::{self, Rng};
@@ -29,6 +29,9 @@ struct Part {
     gradients: Gradients<f32, Cpu>,
     losses: Losses,
     rollout: ImaginedRollout,
+    /// What the rollout was drawn from, to draw it again.
+    start: Latent,
+    rng: Rng,
 }
 
 impl Dreamer {
@@ -80,7 +83,8 @@ impl Networks {
         let loss = world.loss(&mut tape, batch, &mut rng);
         let batch = batch.last(starts);
         let rows = starts * batch.sequences;
-        let rollout = behaviour.imagine(world, &loss.latent.last(rows), &mut rng);
+        let (start, before) = (loss.latent.last(rows), rng.clone());
+        let rollout = behaviour.imagine(world, &start, &mut rng);
         let features = tape.rows(&loss.features, loss.latent.rows() - rows, rows);
         let replay_critic =
             behaviour.replay_critic_loss(&mut tape, world, target, &batch, &features, &rollout.returns[0]);
@@ -91,18 +95,34 @@ impl Networks {
         losses.insert("prior_entropy", loss.prior_entropy);
         let mut all = loss.weighted();
         all.push(replay_critic);
-        Part { gradients: ops::total(tape, &all).backward(), losses, rollout }
+        Part { gradients: ops::total(tape, &all).backward(), losses, rollout, start, rng: before }
     }
 
     /// Adds the gradients of actor and critic on the imagined rollouts, with advantages divided by the return scale.
     fn actor_critic_update(&self, part: Part, scale: f32) -> Part {
-        let Part { gradients, mut losses, rollout } = part;
+        let Part { gradients, mut losses, rollout, start, mut rng } = part;
         let Self { world, behaviour, target } = self;
         // A tape that adds to the gradients that are there already.
         let (_, mut tape) = rollout.features[0].clone().traced(gradients).split_tape();
-        let loss = behaviour.loss(&mut tape, world, target, &rollout, scale);
-        let gradients = ops::total(tape, &loss.weighted()).backward();
-        losses.extend(loss.report);
-        Part { gradients, losses, rollout }
+        let mut loss = behaviour.loss(&mut tape, world, target, &rollout, scale);
+        losses.extend(std::mem::take(&mut loss.report));
+        let gradients = match behaviour.config.gradient {
+            ActorGradient::Reinforce => ops::total(tape, &loss.weighted()).backward(),
+            ActorGradient::Dynamics => {
+                let of_critic = loss.critic.iter().map(|each| (1.0 / loss.critic.len() as f32, each.clone()));
+                let mut gradients = ops::total(tape, &of_critic.collect::<Vec<_>>()).backward();
+                let mut tape = OwnedTape::default();
+                let terms = behaviour.dynamics_loss(&mut tape, world, &start, &rollout, scale, &mut rng);
+                losses.insert("policy_loss", terms.iter().map(|(weight, term)| weight * ops::mean(term)).sum());
+                let mut of_actor = ops::total(tape, &terms).backward();
+                for (_, parameter) in behaviour.policy.parameters() {
+                    let own = ops::take(&mut of_actor, parameter).expect("memory");
+                    let sum = gradients.get_or_alloc_mut(parameter).expect("memory");
+                    sum.iter_mut().zip(own).for_each(|(sum, own)| *sum += own);
+                }
+                gradients
+            }
+        };
+        Part { gradients, losses, rollout, start, rng }
     }
 }

@@ -148,7 +148,18 @@ impl WorldModel {
 
     /// One step of imagination: the latent state after `action` (`[1, rows, actions]`), drawn from the prior.
     pub fn imagine(&self, before: &Latent, action: &Tensor3, rng: &mut Rng) -> Latent {
-        self.rssm.imagine(&mut NoneTape, before, action, rng)
+        self.imagine_on(&mut NoneTape, before, action, rng)
+    }
+
+    /// [`WorldModel::imagine`] on a tape: gradients flow to the actions, too.
+    pub fn imagine_on<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        before: &Latent,
+        action: &Tensor3,
+        rng: &mut Rng,
+    ) -> Latent {
+        self.rssm.imagine(tape, before, action, rng)
     }
 
     /// The observations that are predicted from features `[1, rows, features]`, in physical units: `[rows, observation]`.
@@ -159,6 +170,11 @@ impl WorldModel {
     /// The predicted rewards for arriving in latent states with these features, `[rows]`.
     pub fn rewards(&self, features: &Tensor3) -> Vec<f32> {
         self.bins.decode(&self.reward.forward(features.clone(), Grad::Input))
+    }
+
+    /// The logits of those rewards, `[1, rows, bins]`, with a gradient that flows through to the features only.
+    pub fn reward_logits<T: Tape<f32, Cpu>>(&self, tape: &mut T, features: &Tensor3) -> Tensor3 {
+        self.reward.on(tape, features, Grad::Input)
     }
 
     /// The predicted discount of the future at latent states with these features, `[rows]`: the probability that the episode
