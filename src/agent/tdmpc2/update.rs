@@ -160,7 +160,7 @@ pub(super) fn bootstrapped(batch: &SequenceBatch, q: &[f32], discount: f32, n_st
     let (rewards, terminal) = (&batch.rewards[batch.sequences..], &batch.terminal[batch.sequences..]);
     let target = |first: usize| {
         let steps = (first..one.len()).step_by(batch.sequences).take(n_step);
-        let last = steps.clone().last().expect("the first itself");
+        let last = steps.clone().next_back().expect("the first itself");
         let value = if terminal[last] { 0.0 } else { one[last].min(other[last]) };
         steps.rev().fold(value, |value, i| rewards[i] + discount * value)
     };
