@@ -26,6 +26,8 @@ pub(super) const SMALL: [(&str, &str); 6] = [
          hidden = [8]
          batch = 8
          warm_up = 10
+         warm_up_noise_beta = 1.0
+         exploration_noise_beta = 1.0
          max_gradient_norm = 1.0",
     ),
     (
@@ -271,9 +273,9 @@ fn a_file_can_choose_any_planner() {
             }
         }
     }
-    let config = config_of("pets", "pets.planner.icem.horizon = 7").expect("iCEM");
-    let population = config.settings["planner"]["icem"]["population"].as_integer();
-    assert_eq!(population, Some(40), "the preset's for reach");
+    let config = config_of("pets", "pets.planner.hybrid.icem.horizon = 7").expect("iCEM and gradients");
+    let population = config.settings["planner"]["hybrid"]["icem"]["population"].as_integer();
+    assert_eq!(population, Some(24), "the preset's for reach");
     // Risk measures are a choice too.
     for risk in ["'neutral'", "{ cvar = 0.5 }", "{ mean-std = 0.5 }", "{ entropic = 2.0 }"] {
         let config = config_of("pets", &format!("pets.risk = {risk}\n[for.reach.pets]\nrisk = {{ cvar = 0.25 }}"));
