@@ -59,7 +59,7 @@ impl Registry {
         let presets = PRESETS.iter().map(|(name, text)| (name.to_string(), text.to_string())).collect();
         let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: [Vec::new(), Vec::new()] };
         agents::register(envs::register(registry))
-            .quick_study(&["reach"], &["random", "scripted", "oracle", "pets", "dreamer", "tdmpc2", "sac"])
+            .quick_study(&["reach"], &["random", "scripted", "oracle", "pets", "dreamer", "sac"])
     }
 
     /// Adds an environment; one of the same name is replaced.
