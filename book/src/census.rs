@@ -1,7 +1,6 @@
 //! The census of claims: every test under many shakes of its random streams, and how often each held.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt::Write;
 use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
@@ -28,6 +27,31 @@ struct Program {
     folder: PathBuf,
 }
 
+impl Program {
+    /// Whether each of its tests has a row of its own.
+    fn has_rows_for_tests(&self) -> bool {
+        self.source.contains("tests/")
+    }
+}
+
+/// A program, or some of its tests, under a shake.
+struct Job<'a> {
+    program: &'a Program,
+    shake: u16,
+    /// Only tests whose name contains one of these, or all.
+    names: Vec<String>,
+}
+
+impl<'a> Job<'a> {
+    /// What of a program is asked for: all of it if its source or nothing is named, else the tests of that name. Unit tests are
+    /// counted together, so they are run together.
+    fn new(program: &'a Program, shake: u16, names: &[String]) -> Option<Self> {
+        let whole = names.is_empty() || names.iter().any(|name| program.source.contains(name));
+        let names = if whole { Vec::new() } else { names.to_vec() };
+        (whole || program.has_rows_for_tests()).then_some(Self { program, shake, names })
+    }
+}
+
 /// How a test fared over the shakes: which of them broke it, and where.
 #[derive(Default)]
 struct Record {
@@ -39,24 +63,34 @@ type Records = BTreeMap<(String, String), Record>;
 
 /// Runs every test under the shakes `1..=shakes`, with the AVX-512 kernels and with those for AVX2, and writes the table. What
 /// was run before with the same programs is not run again. A failure ends the command with an error, after the table is written.
-pub fn take(root: &Path, shakes: u16) -> Result<()> {
+///
+/// If there are `names`, only the programs and tests whose name contains one of them are run, and the other rows stay.
+pub fn take(root: &Path, shakes: u16, names: &[String]) -> Result<()> {
     let began = Instant::now();
+    let commit = commit(root)?;
     let mut columns = Vec::new();
     for (kernels, features) in [("AVX-512", "avx512,cli,study"), ("AVX2", "cli,study")] {
         let mut records = Records::new();
         let programs = build(root, features)?;
-        let jobs: Vec<(&Program, u16)> =
-            (1..=shakes).flat_map(|shake| programs.iter().map(move |p| (p, shake))).collect();
-        for ((program, shake), output) in jobs.iter().zip(outputs(root, &jobs)) {
-            count(&mut records, &program.source, *shake, &output?)?;
+        let jobs: Vec<Job> = (1..=shakes)
+            .flat_map(|shake| programs.iter().filter_map(move |program| Job::new(program, shake, names)))
+            .collect();
+        for (job, output) in jobs.iter().zip(outputs(root, &jobs)) {
+            count(&mut records, &job.program.source, job.shake, &output?)?;
         }
         columns.push((kernels, records));
     }
     let path = root.join(PAGE);
     let page = fs::read_to_string(&path).context(PAGE)?;
     let (before, rest) = page.split_once(BEGIN).with_context(|| format!("{PAGE} lacks `{BEGIN}`"))?;
-    let (_, after) = rest.split_once(END).with_context(|| format!("{PAGE} lacks `{END}`"))?;
-    fs::write(&path, format!("{before}{BEGIN}\n\n{}\n{END}{after}", table(&columns)))?;
+    let (table, after) = rest.split_once(END).with_context(|| format!("{PAGE} lacks `{END}`"))?;
+    let mut rows = if names.is_empty() { BTreeMap::new() } else { rows_of(table) };
+    rows.append(&mut rows_of_census(&columns, &commit));
+    let kernels: Vec<&str> = columns.iter().map(|(kernels, _)| *kernels).collect();
+    let mut table =
+        format!("| test | {} | commit |\n| --- |{}\n", kernels.join(" | "), " --- |".repeat(kernels.len() + 1));
+    rows.iter().for_each(|(label, cells)| table.push_str(&format!("| {label} | {cells} |\n")));
+    fs::write(&path, format!("{before}{BEGIN}\n\n{table}\n{END}{after}"))?;
     println!("{PAGE} written; {:.0} minutes", began.elapsed().as_secs_f64() / 60.0);
     let failed: Vec<String> = columns.iter().flat_map(|(kernels, records)| failures(kernels, records)).collect();
     ensure!(failed.is_empty(), "not every claim holds:\n{}", failed.join("\n"));
@@ -92,7 +126,7 @@ fn build(root: &Path, features: &str) -> Result<Vec<Program>> {
 }
 
 /// What each program prints under each shake: as many at once as the machine has cores, each on one thread.
-fn outputs(root: &Path, jobs: &[(&Program, u16)]) -> Vec<Result<String>> {
+fn outputs(root: &Path, jobs: &[Job]) -> Vec<Result<String>> {
     let next = AtomicUsize::new(0);
     let outputs: Vec<OnceLock<Result<String>>> = jobs.iter().map(|_| OnceLock::new()).collect();
     thread::scope(|scope| {
@@ -100,8 +134,8 @@ fn outputs(root: &Path, jobs: &[(&Program, u16)]) -> Vec<Result<String>> {
             scope.spawn(|| {
                 loop {
                     let index = next.fetch_add(1, Ordering::Relaxed);
-                    let Some((program, shake)) = jobs.get(index) else { break };
-                    let _ = outputs[index].set(output(root, program, *shake));
+                    let Some(job) = jobs.get(index) else { break };
+                    let _ = outputs[index].set(output(root, job));
                 }
             });
         }
@@ -110,9 +144,9 @@ fn outputs(root: &Path, jobs: &[(&Program, u16)]) -> Vec<Result<String>> {
 }
 
 /// What a program prints under a shake; from the last census, if it has not changed since.
-fn output(root: &Path, program: &Program, shake: u16) -> Result<String> {
+fn output(root: &Path, Job { program, shake, names }: &Job) -> Result<String> {
     let mut hash = DefaultHasher::new();
-    fs::read(&program.file)?.hash(&mut hash);
+    (fs::read(&program.file)?, names).hash(&mut hash);
     let kept = root.join(format!("target/census/{:016x}-{shake}.txt", hash.finish()));
     if let Ok(output) = fs::read_to_string(&kept) {
         return Ok(output);
@@ -120,6 +154,7 @@ fn output(root: &Path, program: &Program, shake: u16) -> Result<String> {
     let began = Instant::now();
     let output = Command::new(&program.file)
         .arg("--test-threads=1")
+        .args(names)
         .env("HANDFUL_SHAKE", shake.to_string())
         .env("RAYON_NUM_THREADS", "1")
         .env("RUST_BACKTRACE", "0")
@@ -169,34 +204,45 @@ fn failures(kernels: &str, records: &Records) -> Vec<String> {
     records.iter().flat_map(of_test).collect()
 }
 
+/// The version that is counted, as `git` abbreviates it; with a mark if it has changes that are not committed.
+fn commit(root: &Path) -> Result<String> {
+    let output = Command::new("git").args(["describe", "--always", "--dirty=*"]).current_dir(root).output();
+    let output = output.context("git could not be started")?;
+    ensure!(output.status.success(), "git does not know the version of {}", root.display());
+    Ok(String::from_utf8(output.stdout)?.trim().into())
+}
+
+/// The rows of a table that was written before: label and other cells.
+fn rows_of(table: &str) -> BTreeMap<String, String> {
+    let cells = |line: &str| {
+        let (label, cells) = line.strip_prefix("| ")?.strip_suffix(" |")?.split_once(" | ")?;
+        Some((label.to_string(), cells.to_string()))
+    };
+    table.lines().filter_map(cells).filter(|(label, _)| label.contains(": ")).collect()
+}
+
 /// One row for each test of `tests/` and each chapter, one for all unit tests of a program.
-fn table(columns: &[(&str, Records)]) -> String {
-    let names: Vec<&str> = columns.iter().map(|(kernels, _)| *kernels).collect();
-    let mut text = format!("| test | {} |\n| --- |{}\n", names.join(" | "), " --- |".repeat(names.len()));
+fn rows_of_census(columns: &[(&str, Records)], commit: &str) -> BTreeMap<String, String> {
+    let mut rows = BTreeMap::<String, Vec<&(String, String)>>::new();
     let tests: BTreeSet<&(String, String)> = columns.iter().flat_map(|(_, records)| records.keys()).collect();
-    let programs: BTreeSet<&String> = tests.iter().map(|(source, _)| source).collect();
-    for program in programs {
-        let of_program: Vec<&String> =
-            tests.iter().filter(|(source, _)| source == program).map(|(_, test)| test).collect();
-        let rows: Vec<(String, Vec<&String>)> = if program.contains("tests/") {
-            of_program.into_iter().map(|test| (format!("{program}: `{test}`"), vec![test])).collect()
-        } else {
-            vec![(format!("{program}: {} unit tests", of_program.len()), of_program)]
-        };
-        for (label, tests) in rows {
-            let cells = columns.iter().map(|(_, records)| {
-                let records = tests.iter().filter_map(|test| records.get(&(program.clone(), (*test).clone())));
-                let (mut all, mut failed) = (0, BTreeSet::<u16>::new());
-                for record in records {
-                    all = all.max(record.shakes);
-                    failed.extend(record.failures.keys());
-                }
-                format!("{} of {all}", all - failed.len())
-            });
-            let _ = writeln!(text, "| {label} | {} |", cells.collect::<Vec<_>>().join(" | "));
-        }
+    for test in tests {
+        let (program, name) = test;
+        let label =
+            if program.contains("tests/") { format!("{program}: `{name}`") } else { format!("{program}: unit tests") };
+        rows.entry(label).or_default().push(test);
     }
-    text
+    let cells = |tests: Vec<&(String, String)>| {
+        let held = columns.iter().map(|(_, records)| {
+            let (mut all, mut failed) = (0, BTreeSet::<u16>::new());
+            for record in tests.iter().filter_map(|test| records.get(test)) {
+                all = all.max(record.shakes);
+                failed.extend(record.failures.keys());
+            }
+            format!("{} of {all}", all - failed.len())
+        });
+        format!("{} | {commit}", held.collect::<Vec<_>>().join(" | "))
+    };
+    rows.into_iter().map(|(label, tests)| (label, cells(tests))).collect()
 }
 
 #[cfg(test)]
@@ -217,11 +263,11 @@ mod tests {
             failures("AVX2", &records),
             ["AVX2, HANDFUL_SHAKE=2: tests/learning.rs, learns: learning.rs:98:5: mean return -300"]
         );
-        let table = table(&[("AVX2", records)]);
-        assert!(
-            table.contains("| tests/learning.rs: `learns` | 1 of 2 |\n| tests/learning.rs: `plans` | 2 of 2 |"),
-            "{table}"
-        );
+        let rows = rows_of_census(&[("AVX2", records)], "abc");
+        let expected = [("learns", "1 of 2 | abc"), ("plans", "2 of 2 | abc")];
+        assert_eq!(rows, expected.map(|(test, cells)| (format!("tests/learning.rs: `{test}`"), cells.into())).into());
+        let table = "\n| test | AVX2 | commit |\n| --- | --- | --- |\n| tests/learning.rs: `plans` | 2 of 2 | abc |\n";
+        assert_eq!(rows_of(table), [("tests/learning.rs: `plans`".into(), "2 of 2 | abc".into())].into());
         assert!(count(&mut Records::new(), "tests/learning.rs", 3, "\ntest learns ... ok\n").is_err(), "it broke off");
     }
 }

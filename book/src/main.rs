@@ -41,6 +41,8 @@ enum Press {
         /// Under how many
         #[arg(long, default_value_t = 20)]
         shakes: u16,
+        /// Only programs and tests whose name contains one of these (such as chapter_05); the other rows stay
+        names: Vec<String>,
     },
 }
 
@@ -52,7 +54,7 @@ fn main() -> Result<()> {
         Press::Notebooks { names } => notebooks(&root, &names),
         Press::Check => check(&root),
         Press::Format => format(&root),
-        Press::Census { shakes } => census::take(&root, shakes),
+        Press::Census { shakes, names } => census::take(&root, shakes, &names),
     }
 }
 
