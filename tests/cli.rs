@@ -82,8 +82,17 @@ fn a_small_study_from_start_to_report() {
     let folder = tempfile::tempdir().expect("a folder");
     let here = folder.path();
     let study = ["study", "--tasks", "reach", "--methods", "random,scripted,debug", "--seeds", "2", "--out", "study"];
+    let status = || text(&handful(here, &[&study[..], &["--status"]].concat()).stdout);
+    let line = |report: &str, name: &str| -> Vec<String> {
+        let line = report.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_else(|| panic!("{report}"));
+        line.split_whitespace().take(5).map(String::from).collect()
+    };
+    assert_eq!(line(&status(), "reach debug"), ["0", "0", "0", "2", "0"]);
+    assert!(!here.join("study").exists(), "to look at a study begins nothing");
     let output = handful(here, &study);
     assert!(output.status.success(), "{}", text(&output.stderr));
+    assert_eq!(line(&status(), "reach debug"), ["2", "0", "0", "0", "100"]);
+    assert_eq!(line(&status(), "reach scripted"), ["1", "0", "0", "0", "-"]);
     let table = text(&output.stdout);
     assert!(table.contains("scripted") && table.contains("100 % ["), "{table}");
     for file in ["evaluations.csv", "tests.csv", "summary.csv", "report.md", "reach-learning.svg", "reach-test.svg"] {

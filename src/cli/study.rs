@@ -3,7 +3,11 @@
 use std::num::NonZeroUsize;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
+use indicatif::HumanDuration;
+
+use super::output::answer;
 use super::progress::Progress;
 use super::{refuse_folder_of, stop_on_ctrl_c};
 use crate::error::Result;
@@ -11,6 +15,7 @@ use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 use crate::study::runner::{self, Profile, StudyPlan};
 use crate::study::starts::Starts;
+use crate::study::status::{RunState, RunStatus, status, time_left};
 
 #[derive(clap::Args)]
 pub(super) struct Args {
@@ -35,6 +40,9 @@ pub(super) struct Args {
     /// Where to write everything [default: runs/PROFILE]
     #[arg(long)]
     out: Option<PathBuf>,
+    /// Carry nothing out: say how far the runs are, also while another process works on them
+    #[arg(long)]
+    status: bool,
 }
 
 impl Default for Args {
@@ -47,6 +55,7 @@ impl Default for Args {
             starts: None,
             jobs: None,
             out: None,
+            status: false,
         }
     }
 }
@@ -73,11 +82,48 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     refuse_folder_of("run", "config.toml", &plan.folder)?;
     let mut runs = plan.runs(registry)?;
     runs.iter_mut().for_each(|(config, _)| config.starts = args.starts.unwrap_or(config.starts));
+    if args.status {
+        return answer(report_status(&status(&runs), jobs));
+    }
     let stop = stop_on_ctrl_c()?;
     let progress = Progress::new(&runs);
     runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
     progress.finish();
     conclude(&runs, &plan.folder)
+}
+
+/// A line for each task and method, and one for all.
+fn report_status(runs: &[RunStatus], jobs: usize) -> String {
+    let mut groups: Vec<(&str, &str)> = Vec::new();
+    for run in runs {
+        if !groups.contains(&(&run.task, &run.method)) {
+            groups.push((&run.task, &run.method));
+        }
+    }
+    let line = |name: &str, runs: &[RunStatus]| {
+        let count = |state| runs.iter().filter(|run| run.state == state).count();
+        let step: usize = runs.iter().map(|run| run.step).sum();
+        let steps: usize = runs.iter().map(|run| run.steps).sum();
+        let trained = if steps == 0 { String::from("-") } else { format!("{} %", 100 * step / steps) };
+        let left = match time_left(runs, jobs) {
+            _ if step == steps => String::from("-"),
+            Some(seconds) => HumanDuration(Duration::from_secs_f64(seconds)).to_string(),
+            None => String::from("unknown"),
+        };
+        let [complete, running, stopped, waiting] =
+            [RunState::Complete, RunState::Running, RunState::Stopped, RunState::Waiting].map(count);
+        format!("{name:24} {complete:8} {running:7} {stopped:7} {waiting:7} {trained:>7}  {left}\n")
+    };
+    let mut text = format!(
+        "{:24} {:>8} {:>7} {:>7} {:>7} {:>7}  {}\n",
+        "", "complete", "running", "stopped", "waiting", "trained", "time left"
+    );
+    for (task, method) in groups {
+        let alike: Vec<RunStatus> =
+            runs.iter().filter(|run| run.task == task && run.method == method).cloned().collect();
+        text += &line(&format!("{task} {method}"), &alike);
+    }
+    text + line(&format!("all, {jobs} at a time"), runs).trim_end()
 }
 
 fn seed_range(text: &str) -> Result<Range<u64>, String> {

@@ -211,7 +211,16 @@ fn lock(folder: &Path) -> Result<File> {
     std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let path = folder.join(LOCK);
     let file = OpenOptions::new().create(true).append(true).open(&path).map_err(Error::io("write", &path))?;
-    match file.try_lock() {
+    let mut locked = file.try_lock();
+    for _ in 0..5 {
+        if !matches!(locked, Err(TryLockError::WouldBlock)) {
+            break;
+        }
+        // Perhaps somebody only looks whether it is locked: `is_open`.
+        std::thread::sleep(Duration::from_millis(10));
+        locked = file.try_lock();
+    }
+    match locked {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => Err(Error::Config(format!(
             "{}: this run is being carried out elsewhere; wait until that ends, or choose another --out",
@@ -221,6 +230,11 @@ fn lock(folder: &Path) -> Result<File> {
         Err(TryLockError::Error(problem)) if problem.kind() == std::io::ErrorKind::Unsupported => Ok(file),
         Err(TryLockError::Error(problem)) => Err(Error::io("lock", &path)(problem)),
     }
+}
+
+/// Whether a process has the run in a folder open.
+pub(super) fn is_open(folder: &Path) -> bool {
+    File::open(folder.join(LOCK)).is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
 /// The first setting in which two configurations differ.

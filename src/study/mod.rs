@@ -52,6 +52,7 @@ pub mod runner;
 pub mod smoothness;
 pub mod starts;
 pub mod statistics;
+pub mod status;
 #[cfg(feature = "study")]
 mod summary;
 #[cfg(feature = "study")]

@@ -10,6 +10,7 @@ use handful::prelude::*;
 use handful::study::config::RunConfig;
 use handful::study::run::{Event, Run, is_complete};
 use handful::study::runner::{StudyObserver, carry_out_all};
+use handful::study::status::{RunState, status};
 use handful::study::tables::Tables;
 use proptest::prelude::*;
 use proptest::sample::Index;
@@ -72,9 +73,13 @@ fn problem<T>(result: Result<T>) -> String {
 fn a_run_is_open_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = small("small-sac", 0);
+    let state = || status(&[(config.clone(), folder.path().into())])[0].state;
+    assert_eq!(state(), RunState::Waiting);
     let run = open(&config, folder.path()).expect("a new run");
     assert!(problem(open(&config, folder.path())).contains("this run is being carried out elsewhere"));
+    assert_eq!(state(), RunState::Running);
     drop(run);
+    assert_eq!(state(), RunState::Stopped);
     open(&config, folder.path()).expect("the same run");
 }
 
