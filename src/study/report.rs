@@ -241,8 +241,7 @@ fn different_grids(tables: &Tables, task: &str) -> Result<String> {
         format!("`{method}` every {every:.0} steps with {:.0} episodes", episodes[0])
     };
     Ok(format!(
-        "\n**Not evaluated alike:** {}. A coarser grid reports a later step, and with fewer episodes it is more a matter of \
-         luck.\n",
+        "\n**Not evaluated alike:** {}. A coarser grid reports a later step, and fewer episodes a noisier one.\n",
         grids.iter().map(one).collect::<Vec<_>>().join(", ")
     ))
 }

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::{Networks, Pilot, RunningScale, TdMpc2};
+use super::{Controller, Networks, RunningScale, TdMpc2};
 use crate::agent::decision::in_decisions;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
@@ -60,7 +60,7 @@ impl Checkpoint for TdMpc2 {
         state.insert("update_credit", vec![self.update_credit], [1, 1, 1]);
         state.insert_counts("counts", &[self.observed as u64]);
         state.insert_rng("rng", &self.rng);
-        state.insert_rng("planner rng", &self.pilot.rng);
+        state.insert_rng("planner rng", &self.controller.rng);
         state
     }
 
@@ -82,7 +82,7 @@ impl Checkpoint for TdMpc2 {
         self.scale = RunningScale::new(scale.max(f32::MIN_POSITIVE));
         self.update_credit = update_credit;
         self.rng = own;
-        self.pilot = Pilot::new(&self.config, &self.spec, planner);
+        self.controller = Controller::new(&self.config, &self.spec, planner);
         self.decision.reset();
         self.random.reset();
         Ok(())

@@ -4,7 +4,7 @@
 //! ```text
 //! act at random for a while                                               warm_up
 //! repeat at each time step:
-//!     z = h(o); search for action sequences by MPPI over elites,          Pilot, GuidedMppi
+//!     z = h(o); search for action sequences by MPPI over elites,          Controller, GuidedMppi
 //!         among candidates proposed by the policy,                        LatentReturns
 //!         scored by predicted rewards and the value of the last state
 //!     execute the first action of an elite; record the transition         TdMpc2::observe
@@ -26,7 +26,7 @@ mod update;
 use rayon::prelude::*;
 
 pub use config::TdMpc2Config;
-use planning::{Imagined, Pilot};
+use planning::{Controller, Imagined};
 pub use scale::RunningScale;
 
 use super::decision::{Decision, Over};
@@ -93,9 +93,9 @@ pub struct TdMpc2 {
     /// The weights to plan with; None after an update.
     frozen: Option<FrozenModel>,
     /// Plans in the environment that it learns from.
-    pilot: Pilot,
+    controller: Controller,
     /// Plan in the environments that it is evaluated in.
-    slots: Slots<Pilot>,
+    slots: Slots<Controller>,
     rng: Rng,
 }
 
@@ -154,7 +154,7 @@ impl TdMpc2 {
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
             decision: Decision::default(),
             frozen: None,
-            pilot: Pilot::new(&config, spec, rng::stream(seed, "tdmpc2 planner")),
+            controller: Controller::new(&config, spec, rng::stream(seed, "tdmpc2 planner")),
             slots: Slots::default(),
             spec: spec.clone(),
             rng,
@@ -178,11 +178,11 @@ impl TdMpc2 {
     }
 
     /// What the planners plan in, the planner that learns, those of the slots, and how one of the latter is made.
-    fn imagined(&mut self) -> (Imagined<'_>, &mut Pilot, &mut Slots<Pilot>, impl Fn(usize) -> Pilot) {
-        let Self { config, spec, networks, frozen, discount, pilot, slots, .. } = self;
+    fn imagined(&mut self) -> (Imagined<'_>, &mut Controller, &mut Slots<Controller>, impl Fn(usize) -> Controller) {
+        let Self { config, spec, networks, frozen, discount, controller, slots, .. } = self;
         let Networks { model, policy, .. } = networks;
         let frozen = frozen.get_or_insert_with(|| FrozenModel::new(model, policy));
-        (Imagined { model, frozen, discount: *discount }, pilot, slots, |i| Pilot::of_slot(config, spec, i))
+        (Imagined { model, frozen, discount: *discount }, controller, slots, |i| Controller::of_slot(config, spec, i))
     }
 }
 
@@ -194,26 +194,26 @@ impl Agent for TdMpc2 {
 
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         if mode == Mode::Explore && self.observed < self.config.warm_up {
-            let Self { random, rng, pilot, config, .. } = self;
-            return pilot.held.next(config.action_repeat, || random.next(rng));
+            let Self { random, rng, controller, config, .. } = self;
+            return controller.held.next(config.action_repeat, || random.next(rng));
         }
-        let (world, pilot, slots, fresh) = self.imagined();
+        let (world, controller, slots, fresh) = self.imagined();
         match mode {
-            Mode::Explore => pilot.act(world, obs, true, &mut |_| {}),
+            Mode::Explore => controller.act(world, obs, true, &mut |_| {}),
             Mode::Evaluate => slots.state(0, fresh).act(world, obs, false, &mut |_| {}),
         }
     }
 
     fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
-        let (world, _, pilots, fresh) = self.imagined();
-        let pilots = pilots.states(slots, fresh).into_par_iter();
+        let (world, _, controllers, fresh) = self.imagined();
+        let controllers = controllers.states(slots, fresh).into_par_iter();
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
-        pilots.zip(observations).map(|(pilot, obs)| pilot.act(world, obs, false, &mut |_| {})).collect()
+        controllers.zip(observations).map(|(controller, obs)| controller.act(world, obs, false, &mut |_| {})).collect()
     }
 
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        let (world, _, pilots, fresh) = self.imagined();
-        let pilot = pilots.states(&[*slot], fresh).remove(0);
+        let (world, _, controllers, fresh) = self.imagined();
+        let controller = controllers.states(&[*slot], fresh).remove(0);
         // A few of each iteration's candidates, from the best to the worst; those of the last iteration come first.
         let (mut sequences, mut returns) = (Vec::new(), Vec::new());
         let mut observer = |iteration: &Iteration| {
@@ -223,7 +223,7 @@ impl Agent for TdMpc2 {
             sequences.splice(0..0, order.iter().flat_map(|&i| iteration.candidates.row(i)).copied());
             returns.splice(0..0, order.iter().map(|&i| iteration.returns[i]));
         };
-        let action = pilot.act(world, slot.obs, false, &mut observer);
+        let action = controller.act(world, slot.obs, false, &mut observer);
         if returns.is_empty() {
             // An action is held; nothing was planned.
             return (action, Vec::new());
@@ -266,7 +266,7 @@ impl Agent for TdMpc2 {
 
 impl TdMpc2 {
     fn forget_episode(&mut self) {
-        self.pilot.reset();
+        self.controller.reset();
         self.decision.reset();
         self.random.reset();
     }

@@ -50,7 +50,7 @@ pub(super) struct Imagined<'a> {
 }
 
 /// A planner with its own random numbers, for one environment.
-pub(super) struct Pilot {
+pub(super) struct Controller {
     planner: GuidedMppi,
     /// The action that is held.
     pub held: Held,
@@ -60,7 +60,7 @@ pub(super) struct Pilot {
     pub rng: Rng,
 }
 
-impl Pilot {
+impl Controller {
     pub fn new(config: &TdMpc2Config, spec: &Spec, rng: Rng) -> Self {
         let decisions = spec.horizon.div_ceil(config.action_repeat);
         Self {

@@ -16,7 +16,7 @@ use super::summary::summarise;
 use crate::chart::LARGEST;
 use crate::error::{Error, Result};
 use crate::files;
-use read::Layout;
+use read::TableFormat;
 
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
@@ -62,8 +62,8 @@ impl Tables {
                 return Err(Error::data(folder)(problem));
             }
             check_tables(folder)?;
-            let labelled = |file: &str, layout: &Layout| -> Result<LazyFrame> {
-                let frame = read::of_run(&folder.join(file), layout)?.lazy();
+            let labelled = |file: &str, format: &TableFormat| -> Result<LazyFrame> {
+                let frame = read::of_run(&folder.join(file), format)?.lazy();
                 Ok(frame.select([
                     lit(config.task.as_str()).alias("task"),
                     lit(config.method.as_str()).alias("method"),
@@ -75,11 +75,11 @@ impl Tables {
             if config.learns() {
                 evaluations.push(labelled("evaluations.csv", &read::EVALUATIONS)?);
             }
-            for (file, layout, frames) in
+            for (file, format, frames) in
                 [("model.csv", &read::MODELS, &mut models), ("values.csv", &read::VALUES, &mut values)]
             {
                 if folder.join(file).exists() {
-                    frames.push(labelled(file, layout)?);
+                    frames.push(labelled(file, format)?);
                 }
             }
         }

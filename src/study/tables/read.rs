@@ -33,7 +33,7 @@ enum Cell {
 }
 
 /// The columns of a table.
-pub(super) struct Layout {
+pub(super) struct TableFormat {
     /// In the order in which they are written, and whether a table can be without: nothing is computed from these.
     columns: &'static [(&'static str, Cell, Need)],
     /// What the rows of a run are ordered by, from the first to the last.
@@ -58,7 +58,7 @@ const ROUNDING: f64 = 1e-9;
 /// More than any run counts, and few enough for a float.
 const MANY: Cell = Cell::Count(1 << 53);
 
-pub(super) const EVALUATIONS: Layout = Layout {
+pub(super) const EVALUATIONS: TableFormat = TableFormat {
     columns: &[
         ("step", MANY, Always),
         ("episodes", MANY, Always),
@@ -73,7 +73,7 @@ pub(super) const EVALUATIONS: Layout = Layout {
     counts: false,
 };
 
-pub(super) const MODELS: Layout = Layout {
+pub(super) const MODELS: TableFormat = TableFormat {
     columns: &[
         ("step", MANY, Always),
         ("horizon", MANY, Always),
@@ -86,7 +86,7 @@ pub(super) const MODELS: Layout = Layout {
     counts: false,
 };
 
-pub(super) const VALUES: Layout = Layout {
+pub(super) const VALUES: TableFormat = TableFormat {
     columns: &[
         ("step", MANY, Always),
         ("expected", Cell::Measure, Always),
@@ -98,7 +98,7 @@ pub(super) const VALUES: Layout = Layout {
     counts: false,
 };
 
-pub(super) const TESTS: Layout = Layout {
+pub(super) const TESTS: TableFormat = TableFormat {
     columns: &[
         ("episode", MANY, Always),
         ("return", Cell::Number, Always),
@@ -118,8 +118,8 @@ pub(super) const TESTS: Layout = Layout {
 ///
 /// # Errors
 /// If it cannot be read, is empty, lacks a column, or a row cannot be true.
-pub(super) fn of_run(path: &Path, layout: &Layout) -> Result<DataFrame> {
-    let table = read(path, layout, &[])?;
+pub(super) fn of_run(path: &Path, format: &TableFormat) -> Result<DataFrame> {
+    let table = read(path, format, &[])?;
     if table.width() == 0 { Err(Error::data(path)("the table is empty")) } else { Ok(table) }
 }
 
@@ -127,11 +127,11 @@ pub(super) fn of_run(path: &Path, layout: &Layout) -> Result<DataFrame> {
 ///
 /// # Errors
 /// As [`of_run`], but an empty file is none.
-pub(super) fn of_study(path: &Path, layout: &Layout) -> Result<DataFrame> {
-    read(path, layout, &LABELS)
+pub(super) fn of_study(path: &Path, format: &TableFormat) -> Result<DataFrame> {
+    read(path, format, &LABELS)
 }
 
-fn read(path: &Path, layout: &Layout, labels: &[(&'static str, Cell, Need)]) -> Result<DataFrame> {
+fn read(path: &Path, format: &TableFormat, labels: &[(&'static str, Cell, Need)]) -> Result<DataFrame> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
     let bad = |problem: String| Error::data(path)(problem);
     // A number that lost its last digits is a number, too.
@@ -146,7 +146,7 @@ fn read(path: &Path, layout: &Layout, labels: &[(&'static str, Cell, Need)]) -> 
         return Ok(DataFrame::empty());
     }
     let mut columns = Vec::new();
-    for &(name, cell, need) in labels.iter().chain(layout.columns) {
+    for &(name, cell, need) in labels.iter().chain(format.columns) {
         let mut places = (0..header.len()).filter(|i| &header[*i] == name);
         match (places.next(), places.next()) {
             (Some(place), None) => columns.push((name, place, Cells::new(cell))),
@@ -169,11 +169,11 @@ fn read(path: &Path, layout: &Layout, labels: &[(&'static str, Cell, Need)]) -> 
         let text =
             |name: &str| columns.iter().find(|(other, ..)| *other == name).map_or("", |(_, place, _)| &row[*place]);
         let run: Vec<String> = labels.iter().map(|(name, ..)| text(name).to_string()).collect();
-        let here: Vec<u64> = layout.order.iter().map(|name| text(name).parse().unwrap_or_default()).collect();
+        let here: Vec<u64> = format.order.iter().map(|name| text(name).parse().unwrap_or_default()).collect();
         let before = last.insert(run, here.clone()).unwrap_or_default();
-        if here <= before || (layout.counts && here[0] != before.first().unwrap_or(&0) + 1) {
+        if here <= before || (format.counts && here[0] != before.first().unwrap_or(&0) + 1) {
             let place = |numbers: &[u64]| {
-                let each = layout.order.iter().zip(numbers).map(|(name, number)| format!("{name} {number}"));
+                let each = format.order.iter().zip(numbers).map(|(name, number)| format!("{name} {number}"));
                 each.collect::<Vec<_>>().join(", ")
             };
             let before = if before.is_empty() { "nothing".into() } else { place(&before) };
