@@ -39,7 +39,7 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--methods", "random,petz"], &["unknown method `petz`"]);
     refused(here, &["study", "--tasks", "pendulum,pendulum"], &["the task `pendulum` is named twice"]);
     refused(here, &["study", "--methods", "random,debug,debug"], &["the method `debug` is named twice"]);
-    refused(here, &["study", "--seeds", "1000000"], &["6000000 runs", "at most 100000", "fewer seeds"]);
+    refused(here, &["study", "--seeds", "1000000"], &["at most 100000", "fewer seeds"]);
     refused(here, &["study", "--seeds", "0..1000000000"], &["`seed` is 999999999", "it must lie in 0..1048576"]);
     refused(here, &["study", "--seeds", "3..3"], &["no seeds", "3..3"]);
     refused(here, &["study", "--seeds", "0"], &["no seeds"]);

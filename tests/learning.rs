@@ -300,7 +300,7 @@ fn small_dreamer(seed: u64) -> RunConfig {
     let mut config = Registry::standard().config("reach", "dreamer", seed, Some(600), None).expect("a preset");
     (config.evaluate_every, config.evaluation_episodes, config.test_episodes) = (300, 2, 2);
     let mut dreamer: DreamerConfig = config.settings().expect("Dreamer's settings");
-    (dreamer.batch, dreamer.length, dreamer.train_ratio, dreamer.warm_up) = (2, 8, 1.0, 200);
+    (dreamer.batch, dreamer.length, dreamer.dreams, dreamer.train_ratio, dreamer.warm_up) = (2, 8, None, 1.0, 200);
     dreamer.world = WorldModelConfig { units: 16, layers: 1, ..dreamer.world.clone() };
     dreamer.world.rssm = RssmConfig { deter: 16, blocks: 2, hidden: 8, stoch: 4, classes: 4, ..RssmConfig::default() };
     dreamer.behaviour = ActorCriticConfig { units: 16, layers: 1, horizon: 5, ..ActorCriticConfig::default() };

@@ -305,7 +305,7 @@ fn small_runs() -> Vec<RunConfig> {
     (pets.warm_up, pets.planner) = (200, planner.clone());
     pets.ensemble = EnsembleConfig { hidden: vec![16], first_steps: 50, steps: 20, check_every: 10, ..pets.ensemble };
     let mut dreamer: DreamerConfig = run("dreamer").settings().expect("Dreamer's settings");
-    (dreamer.batch, dreamer.length, dreamer.train_ratio, dreamer.warm_up) = (2, 8, 1.0, 200);
+    (dreamer.batch, dreamer.length, dreamer.dreams, dreamer.train_ratio, dreamer.warm_up) = (2, 8, None, 1.0, 200);
     dreamer.world = WorldModelConfig { units: 16, layers: 1, ..dreamer.world };
     dreamer.world.rssm = RssmConfig { deter: 16, blocks: 2, hidden: 8, stoch: 4, classes: 4, ..RssmConfig::default() };
     dreamer.behaviour = ActorCriticConfig { units: 16, layers: 1, horizon: 5, ..ActorCriticConfig::default() };

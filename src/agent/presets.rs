@@ -10,11 +10,12 @@ use crate::error::{Error, Result};
 use crate::settings::{choices, merge};
 
 /// Each preset's name and text.
-pub(crate) const PRESETS: [(&str, &str); 10] = [
+pub(crate) const PRESETS: [(&str, &str); 11] = [
     ("random", include_str!("../../data/presets/random.toml")),
     ("scripted", include_str!("../../data/presets/scripted.toml")),
     ("oracle", include_str!("../../data/presets/oracle.toml")),
     ("pets", include_str!("../../data/presets/pets.toml")),
+    ("pets-learned", include_str!("../../data/presets/pets-learned.toml")),
     ("dreamer", include_str!("../../data/presets/dreamer.toml")),
     ("planet", include_str!("../../data/presets/planet.toml")),
     ("size1m", include_str!("../../data/presets/size1m.toml")),

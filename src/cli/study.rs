@@ -104,7 +104,7 @@ fn report_status(runs: &[RunStatus], jobs: usize) -> String {
         let count = |state| runs.iter().filter(|run| run.state == state).count();
         let step: usize = runs.iter().map(|run| run.step).sum();
         let steps: usize = runs.iter().map(|run| run.steps).sum();
-        let trained = if steps == 0 { String::from("-") } else { format!("{} %", 100 * step / steps) };
+        let trained = (100 * step).checked_div(steps).map_or(String::from("-"), |percent| format!("{percent} %"));
         let left = match time_left(runs, jobs) {
             _ if step == steps => String::from("-"),
             Some(seconds) => HumanDuration(Duration::from_secs_f64(seconds)).to_string(),

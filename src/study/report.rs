@@ -35,7 +35,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += "All methods are evaluated in the same way: the same tasks, observations and initial states, deterministic actions, ";
     text += "and every environment step counted, including the random warm-up. ";
     text += "They are not given the same information: `oracle` plans in the true simulator; `pets` plans in a learned model, but ";
-    text += "is given the reward function; `dreamer`, `tdmpc2` and `sac` have only the rewards that they receive.\n\n";
+    text += "is given the reward function; `pets-learned`, `dreamer`, `tdmpc2` and `sac` have only the rewards that they receive.\n\n";
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(

@@ -46,7 +46,7 @@ impl StudyPlan {
             }
             Profile::Full => Self {
                 tasks: named(&["reach", "push", "lift"]),
-                methods: named(&["random", "scripted", "oracle", "pets", "dreamer", "tdmpc2", "sac"]),
+                methods: named(&["random", "scripted", "oracle", "pets", "pets-learned", "dreamer", "tdmpc2", "sac"]),
                 seeds: 0..5,
                 folder,
             },
