@@ -100,6 +100,7 @@ impl Chart {
             let line = colour.stroke_width(if *shape == Shape::Dashed { 2 } else { 3 });
             let series = match shape {
                 Shape::Line => chart.draw_series(LineSeries::new(points, line))?,
+                Shape::Thin => chart.draw_series(LineSeries::new(points, colour.mix(0.5).stroke_width(1)))?,
                 Shape::Dashed => chart.draw_series(DashedLineSeries::new(points, 7, 5, line))?,
                 Shape::Points => {
                     chart.draw_series(points.into_iter().map(|p| Circle::new(p, 3, colour.mix(0.7).filled())))?
@@ -117,7 +118,7 @@ impl Chart {
                     Shape::Points | Shape::Dots => {
                         series.legend(move |(x, y)| Circle::new((x + 11, y), 3, line.filled()))
                     }
-                    Shape::Line | Shape::Band => {
+                    Shape::Line | Shape::Thin | Shape::Band => {
                         series.legend(move |(x, y)| PathElement::new([(x, y), (x + 22, y)], line))
                     }
                 };

@@ -1,4 +1,4 @@
-//! Charts as SVG: lines, points and bands in one frame ([`Chart`]), or frames side by side ([`Panels`]).
+//! Charts as SVG: lines, points and bands in one frame ([`Chart`]), or several frames ([`Panels`]).
 //!
 //! In a notebook, either one is displayed if it is the last expression of a cell. Numbers that no axis can show (not finite, or
 //! beyond 1e100) are left out.
@@ -88,6 +88,7 @@ impl Default for Ticks {
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Shape {
     Line,
+    Thin,
     Dashed,
     Points,
     Dots,
@@ -167,6 +168,11 @@ impl Chart {
     /// Adds a line through `(x, y)` points.
     pub fn line(self, name: &str, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
         self.with(name, Shape::Line, points.into_iter().collect())
+    }
+
+    /// Adds a thin, pale line: one run of several, or what others did.
+    pub fn thin(self, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
+        self.with("", Shape::Thin, points.into_iter().collect())
     }
 
     /// Adds a dashed line, for a bound, a baseline or the true values.

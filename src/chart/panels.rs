@@ -2,7 +2,10 @@ use super::draw::{self, Drawn, Frame};
 use super::{Chart, FONT};
 use crate::error::Result;
 
-/// Charts side by side under one title.
+/// How many charts a row has at most.
+const COLUMNS: usize = 3;
+
+/// Charts under one title: up to three side by side, more in rows.
 #[derive(Clone, Debug, Default)]
 pub struct Panels {
     title: String,
@@ -15,25 +18,28 @@ impl Panels {
         Self { title: title.into(), charts: Vec::new() }
     }
 
-    /// Adds a chart to the right of the others.
+    /// Adds a chart after the others.
     pub fn panel(mut self, chart: Chart) -> Self {
         self.charts.push(chart);
         self
     }
 
-    /// Draws the charts and returns them as one SVG, 820 by 440 pixels.
+    /// Draws the charts and returns them as one SVG: 820 by 440 pixels, or 280 pixels for each of several rows.
     ///
     /// # Errors
     /// If there is nothing to draw in one of them.
     pub fn svg(&self) -> Result<String> {
+        let rows = self.charts.len().div_ceil(COLUMNS).max(1);
+        let columns = self.charts.len().div_ceil(rows).max(1);
+        let height = if rows == 1 { 440 } else { 40 + 280 * rows as u32 };
         let mut svg = String::new();
-        let area = draw::canvas(&mut svg, (820, 440))?;
+        let area = draw::canvas(&mut svg, (820, height))?;
         let body = || -> Drawn<_> {
             let body = area.margin(14, 10, 10, 10);
             Ok(if self.title.is_empty() { body } else { body.titled(&self.title, (FONT, 20))? })
         };
         let body = body().map_err(draw::failed)?;
-        for (area, chart) in body.split_evenly((1, self.charts.len().max(1))).iter().zip(&self.charts) {
+        for (area, chart) in body.split_evenly((rows, columns)).iter().zip(&self.charts) {
             chart.draw_on(area, &Frame::PANEL)?;
         }
         drop((body, area));

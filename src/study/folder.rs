@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::config::{RunConfig, bad_config};
 use super::evaluate::{Evaluation, Summary};
 use super::records::{Progress, TABLES, write_test};
+use super::tensorboard;
 use crate::agent::Method;
 use crate::checkpoint::Weights;
 use crate::error::{Error, Result};
@@ -98,7 +99,8 @@ impl RunFolder {
             weights.set_note(RUN, config.to_toml());
             weights.write(&self.path.join(WEIGHTS))?;
         }
-        progress.write_tables(&self.path)
+        progress.write_tables(&self.path)?;
+        tensorboard::write(&self.path, progress)
     }
 
     /// Writes the results of the test, which complete the run.

@@ -57,3 +57,4 @@ pub mod status;
 mod summary;
 #[cfg(feature = "study")]
 pub mod tables;
+mod tensorboard;

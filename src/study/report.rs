@@ -42,9 +42,10 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         "\nSuccess: share of test episodes in which the task is solved at the last step, with a 95 % interval. With several \
          seeds, that is the two-level bootstrap: seeds are drawn, then the episodes of each. With one seed (a method that does \
          not learn needs only one), and where all episodes have the same outcome, it is the Wilson interval, which covers the \
-         test episodes and not the differences between seeds. Steps to {:.0} %: the first evaluation at which that success \
-         rate is reached and held at the next; median over seeds (a dash if the median seed does not reach it within its \
-         budget). SPARC, LDLJ: smoothness of the hand's movement; closer to zero is smoother.\n",
+         test episodes and not the differences between seeds. {:.0} % by step: the first evaluation at which that success \
+         rate is reached and held at the next, and the seconds of training until then, on a machine that several runs shared; \
+         medians over seeds (a dash if the median seed does not reach it within its budget). ms per action: the time that \
+         choosing an action takes in the last evaluation. SPARC, LDLJ: smoothness of the hand's movement; closer to zero is smoother.\n",
         100.0 * LEVEL
     );
     for task in &tasks {
@@ -98,9 +99,10 @@ fn tuning_note(tables: &Tables) -> Result<&'static str> {
     })
 }
 
-const HEAD: [&str; 9] = ["task", "method", "seeds", "steps", "success", "return", "steps to 80 %", "SPARC", "LDLJ"];
+const HEAD: [&str; 10] =
+    ["task", "method", "seeds", "steps", "success", "return", "80 % by step", "ms per action", "SPARC", "LDLJ"];
 
-fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
+fn rows(tables: &Tables) -> Result<Vec<[String; 10]>> {
     let mut rows = Vec::new();
     for (task, method) in tables.tasks_and_methods()? {
         let value = |column: &str| tables.value(&task, &method, column);
@@ -121,7 +123,12 @@ fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
             show("steps", 0)?,
             success,
             show("return_mean", 1)?,
-            value("steps_to_80")?.map_or("-".into(), |steps| format!("by {steps:.0}")),
+            match (value("steps_to_80")?, value("seconds_to_80")?) {
+                (Some(steps), Some(seconds)) => format!("{steps:.0} ({seconds:.0} s)"),
+                (Some(steps), None) => format!("{steps:.0}"),
+                (None, _) => "-".into(),
+            },
+            show("action_ms", 2)?,
             show("smoothness_sparc", 2)?,
             show("smoothness_ldlj", 2)?,
         ]);
@@ -129,14 +136,14 @@ fn rows(tables: &Tables) -> Result<Vec<[String; 9]>> {
     Ok(rows)
 }
 
-fn markdown(rows: &[[String; 9]]) -> String {
+fn markdown(rows: &[[String; 10]]) -> String {
     let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
     let head = line(&HEAD.map(String::from));
     let rule = format!("|{}\n", " --- |".repeat(HEAD.len()));
     head + &rule + &rows.iter().map(|row| line(row)).collect::<String>()
 }
 
-fn text_table(rows: &[[String; 9]]) -> String {
+fn text_table(rows: &[[String; 10]]) -> String {
     let mut table = comfy_table::Table::new();
     table.load_style(comfy_table::presets::UTF8_HORIZONTAL_ONLY).set_header(HEAD);
     for row in rows {

@@ -17,6 +17,10 @@ struct Runs {
     success: Vec<Vec<f64>>,
     /// For each seed, the success curve; empty if the method does not learn.
     curves: Vec<Curve>,
+    /// For each seed, the seconds of training until each evaluation; empty if the tables do not have them.
+    clocks: Vec<Curve>,
+    /// For each seed, the milliseconds that an action takes in each evaluation; the same.
+    action_ms: Vec<Curve>,
     /// Columns of the test whose mean is taken over all episodes.
     means: Vec<(&'static str, Option<f64>)>,
 }
@@ -39,8 +43,13 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
             let known: Vec<f64> = lists(&rows, column)?.concat().into_iter().filter(|x| x.is_finite()).collect();
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
-        let (success, curves) = (lists(&rows, "success")?, curves(evaluations, &task, &method, "success")?);
-        all.push(Runs { task, method, success, curves, means });
+        let success = lists(&rows, "success")?;
+        let over_steps = |column: &str| match evaluations.column(column) {
+            Ok(_) => curves(evaluations, &task, &method, column),
+            Err(_) => Ok(Vec::new()),
+        };
+        let [curves, clocks, action_ms] = [over_steps("success")?, over_steps("seconds")?, over_steps("action_ms")?];
+        all.push(Runs { task, method, success, curves, clocks, action_ms, means });
     }
     let names = |of: fn(&Runs) -> &String| all.iter().map(|runs| of(runs).clone()).collect::<Vec<String>>();
     let mut columns =
@@ -58,7 +67,7 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
 }
 
 /// The columns after task and method. Scripts read them by name: new ones are added at the end, none is removed.
-const SUMMARY: [&str; 26] = [
+const SUMMARY: [&str; 28] = [
     "seeds",
     "steps",
     "test_episodes",
@@ -85,6 +94,8 @@ const SUMMARY: [&str; 26] = [
     "sac_steps_ratio",
     "sac_steps_ratio_low",
     "sac_steps_ratio_high",
+    "seconds_to_80",
+    "action_ms",
 ];
 
 /// The stream of every bootstrap: the tables alone decide its result.
@@ -105,6 +116,12 @@ impl Runs {
     /// By which step each seed reaches the level.
     fn times(&self) -> Vec<Option<f64>> {
         self.curves.iter().map(|(x, y)| steps_to(LEVEL, x, y)).collect()
+    }
+
+    /// After how many seconds of training each seed reaches the level.
+    fn seconds(&self) -> Vec<Option<f64>> {
+        let at = |(steps, seconds): &Curve, time: f64| Some(seconds[steps.iter().position(|step| *step == time)?]);
+        self.times().into_iter().zip(&self.clocks).map(|(time, clock)| at(clock, time?)).collect()
     }
 
     fn row(&self, all: &[Self]) -> Vec<(&'static str, Option<f64>)> {
@@ -138,6 +155,11 @@ impl Runs {
             let learners = all.iter().filter(|other| other.task == self.task && other.learns());
             let lasts = learners.flat_map(|other| &other.curves).filter_map(|(x, _)| x.last().copied());
             let common = lasts.reduce(f64::min).unwrap_or(budget);
+            if !self.clocks.is_empty() {
+                row.push(("seconds_to_80", censored_median(&self.seconds())));
+            }
+            let last: Vec<f64> = self.action_ms.iter().filter_map(|(_, ms)| ms.last().copied()).collect();
+            row.push(("action_ms", Some(mean(&last))));
             let areas: Vec<f64> = self.curves.iter().map(|(x, y)| area_under_curve(x, y, common)).collect();
             row.extend([
                 ("steps_to_80", censored_median(&times)),

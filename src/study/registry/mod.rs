@@ -58,10 +58,8 @@ impl Registry {
     pub fn standard() -> Self {
         let presets = PRESETS.iter().map(|(name, text)| (name.to_string(), text.to_string())).collect();
         let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: [Vec::new(), Vec::new()] };
-        agents::register(envs::register(registry)).quick_study(
-            &["reach"],
-            &["random", "scripted", "oracle", "pets", "pets-learned", "dreamer", "tdmpc2", "sac"],
-        )
+        agents::register(envs::register(registry))
+            .quick_study(&["reach"], &["random", "scripted", "oracle", "pets", "dreamer", "tdmpc2", "sac"])
     }
 
     /// Adds an environment; one of the same name is replaced.

@@ -30,7 +30,8 @@ pub type Curve = (Vec<f64>, Vec<f64>);
 /// The tables of a study.
 #[derive(Clone, Debug)]
 pub struct Tables {
-    /// task, method, seed, step, success, ...: one row per evaluation of each learning run.
+    /// task, method, seed, step, success, ..., seconds: one row per evaluation of each learning run. The seconds are those of
+    /// training until then; tables of earlier versions do not have them.
     pub evaluations: DataFrame,
     /// task, method, seed, step, horizon, rmse, ...: the open-loop prediction error of each learned model on
     /// the episodes of each evaluation.
@@ -62,18 +63,22 @@ impl Tables {
                 return Err(Error::data(folder)(problem));
             }
             check_tables(folder)?;
-            let labelled = |file: &str, format: &TableFormat| -> Result<LazyFrame> {
-                let frame = read::of_run(&folder.join(file), format)?.lazy();
-                Ok(frame.select([
+            let label = |frame: DataFrame| {
+                frame.lazy().select([
                     lit(config.task.as_str()).alias("task"),
                     lit(config.method.as_str()).alias("method"),
                     lit(config.seed).alias("seed"),
                     all().as_expr(),
-                ]))
+                ])
+            };
+            let labelled = |file: &str, format: &TableFormat| -> Result<LazyFrame> {
+                Ok(label(read::of_run(&folder.join(file), format)?))
             };
             tests.push(labelled("test.csv", &read::TESTS)?.with_column(lit(config.starts.name()).alias("starts")));
             if config.learns() {
-                evaluations.push(labelled("evaluations.csv", &read::EVALUATIONS)?);
+                let rows = read::of_run(&folder.join("evaluations.csv"), &read::EVALUATIONS)?;
+                let episodes = read::of_run(&folder.join("episodes.csv"), &read::EPISODES)?;
+                evaluations.push(label(with_seconds(rows, &episodes).map_err(inside)?));
             }
             for (file, format, frames) in
                 [("model.csv", &read::MODELS, &mut models), ("values.csv", &read::VALUES, &mut values)]
@@ -229,6 +234,15 @@ impl Tables {
         };
         found().map_err(inside)
     }
+}
+
+/// The evaluations of a run, with the seconds of training until each: those of the last episode before it.
+fn with_seconds(mut evaluations: DataFrame, episodes: &DataFrame) -> PolarsResult<DataFrame> {
+    let ends: Vec<_> = numbers(episodes, "step")?.into_iter().zip(numbers(episodes, "seconds")?).collect();
+    let until = |step: Option<f64>| ends.iter().rev().find(|(end, _)| *end <= step).map_or(Some(0.0), |(_, s)| *s);
+    let seconds: Vec<Option<f64>> = numbers(&evaluations, "step")?.into_iter().map(until).collect();
+    evaluations.with_column(Column::new("seconds".into(), seconds))?;
+    Ok(evaluations)
 }
 
 pub(super) fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {

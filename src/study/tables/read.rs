@@ -68,7 +68,14 @@ pub(super) const EVALUATIONS: TableFormat = TableFormat {
         ("smoothness_sparc", Cell::Measure, Optional),
         ("smoothness_ldlj", Cell::Measure, Optional),
         ("action_ms", Cell::Number, Optional),
+        ("seconds", Cell::Number, Optional),
     ],
+    order: &["step"],
+    counts: false,
+};
+
+pub(super) const EPISODES: TableFormat = TableFormat {
+    columns: &[("step", MANY, Always), ("seconds", Cell::Number, Always)],
     order: &["step"],
     counts: false,
 };
