@@ -114,7 +114,8 @@ fn results(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
             found.extend(below.into_iter().map(|(file, bytes)| (Path::new(&name).join(file), bytes)));
         } else if name.ends_with(".csv") {
             found.insert(name.into(), without_times(&fs::read_to_string(&path).expect("a table")).into());
-        } else if !["summary.toml", "report.md", "events.out.tfevents.handful"].contains(&name.as_str()) {
+        } else if !["summary.toml", "report.md", "report.html", "events.out.tfevents.handful"].contains(&name.as_str())
+        {
             found.insert(name.into(), fs::read(&path).expect("a file"));
         }
     }

@@ -192,7 +192,7 @@ fn paired_differences() {
 fn a_summary_says_what_its_seeds_can_tell() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut tests = String::from("task,method,seed,episode,return,success,length,stage,sparc,ldlj\n");
-    let mut evaluations = String::from("task,method,seed,step,episodes,success\n");
+    let mut evaluations = String::from("task,method,seed,step,episodes,success,action_ms,seconds\n");
     for (method, successes, every, last) in [
         ("dreamer", vec![20, 20, 20, 0, 20], 500, 2000),
         ("pets", vec![20, 20], 500, 1000),
@@ -204,7 +204,8 @@ fn a_summary_says_what_its_seeds_can_tell() {
             }
             for step in (0..=last).step_by(every) {
                 let success = if step >= 1000 { successes as f64 / 20.0 } else { 0.0 };
-                evaluations += &format!("pole,{method},{seed},{step},20,{success:?}\n");
+                let seconds = step as f64 / 100.0 + seed as f64;
+                evaluations += &format!("pole,{method},{seed},{step},20,{success:?},{}.5,{seconds}\n", step / 1000);
             }
         }
     }
@@ -228,6 +229,9 @@ fn a_summary_says_what_its_seeds_can_tell() {
     assert_eq!((value("pets", "success_iqm"), value("pets", "success_iqm_low")), (None, None));
     assert_eq!((value("dreamer", "steps_to_80"), value("sac", "steps_to_80")), (Some(1000.0), None));
     assert_eq!(value("dreamer", "seeds_reaching_80"), Some(4.0));
+    // Ten seconds and the seed's number; seed 3 does not get there.
+    assert_eq!((value("dreamer", "seconds_to_80"), value("sac", "seconds_to_80")), (Some(12.0), None));
+    assert_eq!((value("dreamer", "action_ms"), value("pets", "action_ms")), (Some(2.5), Some(1.5)));
     assert_eq!(value("dreamer", "steps_to_80_restricted_mean"), Some(1200.0));
     assert_eq!(value("sac", "steps_to_80_restricted_mean"), Some(2000.0));
     // Areas end where the shortest budget does.
@@ -239,7 +243,10 @@ fn a_summary_says_what_its_seeds_can_tell() {
     let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
-        "| by 1000 |",
+        "| 1000 (12 s) | 2.50 |",
+        "- **pole**: `dreamer` is first at 80 % success, by step 1000. Fewer steps to it than `sac`: `pets`. Seeds that never get \
+         there, so no ratio to `sac`: `dreamer`. Higher final success than `sac`: `pets`. No certain difference in final success \
+         from `sac`: `dreamer`.",
         "one seed: the interval covers its test episodes, not what another seed would bring",
         "minus that of `sac`: +50 percentage points [",
         "takes at least 2.0 times as many steps",

@@ -43,6 +43,8 @@ pub mod evaluate;
 pub mod figures;
 mod folder;
 mod names;
+#[cfg(feature = "study")]
+mod page;
 pub mod records;
 pub mod registry;
 #[cfg(feature = "study")]
@@ -58,3 +60,5 @@ mod summary;
 #[cfg(feature = "study")]
 pub mod tables;
 mod tensorboard;
+#[cfg(feature = "study")]
+mod verdict;

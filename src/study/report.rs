@@ -5,16 +5,18 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::figures;
+use super::page;
 use super::starts::Starts;
 use super::tables::{BASELINE, Curve, LEVEL, Tables};
+use super::verdict::verdict;
 use crate::error::Result;
 use crate::files;
 
 /// A temporary file that is older than this is nobody's any more.
 const ABANDONED: Duration = Duration::from_secs(3600);
 
-/// Reads a study's tables from the folder `from`, and writes `summary.csv`, the figures and `report.md` into the folder
-/// `to`. Returns the table of results as text.
+/// Reads a study's tables from the folder `from`, and writes `summary.csv`, the figures, `report.md` and the same as a
+/// page that needs no other file, `report.html`, into the folder `to`. Returns the table of results as text.
 ///
 /// # Errors
 /// If a table is missing or damaged, or if a file cannot be written.
@@ -36,6 +38,10 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += "and every environment step counted, including the random warm-up. ";
     text += "They are not given the same information: `oracle` plans in the true simulator; `pets` plans in a learned model, but ";
     text += "is given the reward function; `pets-learned`, `dreamer`, `tdmpc2` and `sac` have only the rewards that they receive.\n\n";
+    let verdict = verdict(&tables, &tasks)?;
+    if !verdict.is_empty() {
+        text += &format!("## Verdict\n\n{verdict}\n");
+    }
     text += "## Results\n\n";
     text += &markdown(&rows(&tables)?);
     text += &format!(
@@ -85,6 +91,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += "\n## How certain is this?\n\n";
     text += &caveat(&tables, &pairs)?;
     files::write(&to.join("report.md"), text.as_bytes())?;
+    files::write(&to.join("report.html"), page::page(&text, to)?.as_bytes())?;
     Ok(tuning_note(&tables)?.to_string() + &text_table(&rows(&tables)?))
 }
 
