@@ -164,6 +164,7 @@ pub fn read_summary(folder: &Path) -> Result<Summary> {
 
 /// # Errors
 /// If the tables of a complete run are not those that it ended with.
+#[cfg(feature = "study")]
 pub(super) fn check_tables(folder: &Path) -> Result<()> {
     match Completed::read(folder).ok().and_then(|run| run.changed(folder, ".csv")) {
         None => Ok(()),
