@@ -49,6 +49,98 @@ fn every_chapter_is_in_the_summary_and_nothing_else_is() {
     assert_eq!(summary.matches(".md)").count(), chapters().len() + notes);
 }
 
+/// What the look-up page calls functions and types of the library is there.
+#[test]
+fn the_index_names_what_there_is() {
+    let page = std::fs::read_to_string(root().join("chapters/notes/lookup.md")).expect("a page");
+    let mut sources = String::new();
+    let mut folders = vec![root().join("src")];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|kind| kind == "rs") {
+                sources += &std::fs::read_to_string(path).expect("a source file");
+            }
+        }
+    }
+    let quoted = page.split('`').skip(1).step_by(2).filter(|text| text.contains("::"));
+    let names: Vec<&str> = quoted.flat_map(|path| path.split("::")).collect();
+    assert!(names.len() > 40);
+    for name in names {
+        let defined = ["fn", "struct", "enum", "mod"].map(|kind| format!("pub {kind} {name}"));
+        assert!(defined.iter().any(|item| sources.contains(item.as_str())), "`{name}` is not in the library");
+    }
+}
+
+/// A number in the summary of a study.
+fn in_study(study: &str, task: &str, method: &str, column: &str) -> f64 {
+    let path = root().join("data/study").join(study).join("summary.csv");
+    let table = std::fs::read_to_string(path).expect("a summary");
+    let mut lines = table.lines().map(|line| line.split(',').collect::<Vec<&str>>());
+    let columns = lines.next().expect("a header");
+    let place = columns.iter().position(|name| *name == column).expect("a column");
+    let row = lines.find(|row| row[..2] == [task, method]).expect("a row");
+    row[place].parse().unwrap_or(f64::NAN)
+}
+
+/// README and chapters say what the tables of the studies say.
+#[test]
+fn numbers_from_studies_are_quoted_as_they_are() {
+    let success = |study: &str, task: &str, method: &str| {
+        let [rate, low, high] =
+            ["success", "success_low", "success_high"].map(|column| 100.0 * in_study(study, task, method, column));
+        format!("{rate:.0} % [{low:.0}, {high:.0}]")
+    };
+    let quick = |method: &str, column: &str| in_study("quick", "reach", method, column);
+    let reach = |method: &str, column: &str| in_study("reach", "reach", method, column);
+    let thousands = |steps: f64| match steps as usize {
+        steps if steps < 1000 => steps.to_string(),
+        steps => format!("{},{:03}", steps / 1000, steps % 1000),
+    };
+    let mut quotes: Vec<(&str, String)> = Vec::new();
+    for (name, method) in [("random", "random"), ("scripted (by hand)", "scripted")] {
+        let (success, sparc) = (success("quick", "reach", method), quick(method, "smoothness_sparc"));
+        quotes.push(("README.md", format!("| {name} | {success} | - | - | {sparc:.2} |")));
+    }
+    for (name, method, digits) in
+        [("PETS (knows the reward)", "pets", 1), ("Dreamer", "dreamer", 2), ("TD-MPC2", "tdmpc2", 1), ("SAC", "sac", 3)]
+    {
+        let [steps, seconds, ms, sparc] =
+            ["steps_to_80", "seconds_to_80", "action_ms", "smoothness_sparc"].map(|column| quick(method, column));
+        let (success, steps) = (success("quick", "reach", method), thousands(steps));
+        let row = format!("| {name} | {success} | {steps}, after {seconds:.0} s | {ms:.digits$} | {sparc:.2} |");
+        quotes.push(("README.md", row));
+    }
+    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("pets", column));
+    quotes.push(("README.md", format!("SAC takes at least {ratio:.1} times as many (95 % interval from {low:.1})")));
+    quotes.push(("chapters/00-start.md", format!("needs at least {ratio:.1} times as many")));
+    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("tdmpc2", column));
+    quotes.push(("README.md", format!("fewer than SAC ({ratio:.1} times, interval from {low:.1})")));
+    quotes.push((
+        "README.md",
+        format!("PETS reaches in {} of the test episodes", success("reach", "reach", "pets-learned")),
+    ));
+    let pets = 500.0 * reach("pets", "success");
+    quotes.push(("chapters/06-pets.md", format!("five seeds after 3,000 steps, {pets:.0} of 500 succeed")));
+    let sac = 500.0 * reach("sac", "success");
+    quotes.push(("chapters/10-study.md", format!("SAC succeeded in {sac:.0} of 500 episodes")));
+    let [seeds, steps] = ["seeds_reaching_80", "steps_to_80"].map(|column| reach("dreamer", column));
+    assert_eq!(seeds, 4.0);
+    let dreamer =
+        format!("Four of five seeds of Dreamer are at 80 % within 3,000 steps, the median by {}", thousands(steps));
+    quotes.push(("chapters/08-dreamer.md", dreamer));
+    let steps = thousands(reach("sac", "steps_to_80"));
+    let sac = format!("Four of five seeds of SAC reach 80 % within 3,000 steps, the median by {steps}");
+    quotes.push(("chapters/09-sac.md", sac));
+    for (file, quote) in quotes {
+        let text = std::fs::read_to_string(root().join(file)).expect("a page");
+        let text = text.split_whitespace().collect::<Vec<&str>>().join(" ");
+        assert!(text.contains(&quote), "{file} does not say what the tables say: {quote}");
+    }
+}
+
 #[test]
 fn a_chapter_is_taken_apart_and_its_program_keeps_the_lines() {
     let text = "# Title\n\n```rust\nlet x = 1; // one\n```\ntext\n\n```rust,ignore\nnot run\n```\n<details>\n\n```rust\nx\n```\n</details>\n";
