@@ -555,3 +555,19 @@ fn renamed_keys_are_understood() {
     std::fs::write(run.join("config.toml"), text).expect("a writable folder");
     open(&config, &run).expect("the same run");
 }
+
+/// The agents that ship with the repository: of other starts than those of their test, they reach most goals.
+#[test]
+fn trained_agents_that_ship_still_reach() {
+    let registry = Registry::standard();
+    let mut agents = 0;
+    for folder in std::fs::read_dir("data/trained").expect("a folder") {
+        let folder = folder.expect("an entry").path();
+        let (config, mut method) = registry.trained_method(&folder).expect("a trained agent");
+        let mut evaluator = Evaluator::new(|| registry.make_env(&config)).expect("a world");
+        let summary = evaluator.evaluate(&mut method, 20, EvalSeeds::Seed(1)).expect("valid actions").summary();
+        assert!(summary.success >= 0.7, "{}: {}", folder.display(), summary.success);
+        agents += 1;
+    }
+    assert_eq!(agents, 4);
+}
