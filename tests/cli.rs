@@ -112,7 +112,7 @@ fn a_small_study_from_start_to_report() {
     let head = std::fs::read_to_string(here.join("study/reach/debug/seed0/evaluations.csv")).expect("evaluations");
     assert_eq!(
         head.lines().next(),
-        Some("step,episodes,success,return_mean,return_std,smoothness_sparc,smoothness_ldlj,action_ms")
+        Some("step,episodes,success,return_mean,return_std,smoothness_sparc,smoothness_ldlj,action_ms,updates")
     );
 
     // A second time, nothing is run again, and the table is the same.

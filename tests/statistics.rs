@@ -13,11 +13,11 @@ use handful::prelude::*;
 use handful::rng;
 use handful::study::config::RunConfig;
 use handful::study::run::Event;
-use handful::study::smoothness::{ldlj, of_path, sparc};
+use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
-    area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference, ratio_of_means,
-    restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
+    area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
+    probability_of_improvement, ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
 };
 use rayon::prelude::*;
 
@@ -66,6 +66,13 @@ fn smoothness_of_known_movements() {
         near("tremor: SPARC", sparc(&speed, 100.0), spectral, 1e-7);
         near("tremor: LDLJ", ldlj(&along_x(&speed), 100.0), jerk, 1e-7);
     }
+}
+
+#[test]
+fn changes_of_actions() {
+    let actions = [[0.0, 1.0], [1.0, 1.0], [1.0, -1.0]].map(Vec::from);
+    near("two numbers, two changes", action_change(&actions).expect("three actions"), 1.25_f64.sqrt(), 1e-12);
+    assert_eq!((action_change(&actions[..1]), action_change(&[])), (None, None));
 }
 
 #[test]
@@ -128,7 +135,13 @@ fn censored_times() {
     let means = [restricted_mean(&first, 150.0), restricted_mean(&second, 150.0)];
     assert_eq!(means, [102.0, 60.0]);
     assert_eq!(censored_median(&[Some(60.0), None, None]), None, "the median is censored itself");
+    // The second is earlier in 22 of 25 pairs.
+    let sooner = |times: &[Option<f64>]| times.iter().map(|t| -t.unwrap_or(f64::INFINITY)).collect::<Vec<f64>>();
     let mut rng = rng::stream(0, "ratio test");
+    let (earlier, [low, high]) = probability_of_improvement(&sooner(&second), &sooner(&first), &mut rng);
+    near("earlier", earlier, 0.88, 1e-12);
+    assert!(low < 0.88 && low > 0.4 && high == 1.0, "{low} {high}");
+    assert_eq!(probability_of_improvement(&[1.0], &[1.0, 1.0], &mut rng), (0.5, [0.5; 2]));
     let (ratio, [low, high]) =
         ratio_of_means(&[60.0, 80.0, 100.0, 120.0, 150.0], &[40.0, 50.0, 50.0, 70.0, 90.0], &mut rng);
     near("ratio", ratio, 1.7, 1e-12);
@@ -240,6 +253,16 @@ fn a_summary_says_what_its_seeds_can_tell() {
     assert_eq!(value("pets", "success_minus_sac"), Some(0.5));
     assert_eq!((value("pets", "sac_steps_ratio"), value("dreamer", "sac_steps_ratio")), (Some(2.0), None));
     assert_eq!(value("sac", "success_minus_sac"), None);
+    // Four of five seeds have more success, and are earlier; the fifth ties in that neither gets there.
+    assert_eq!(
+        (value("dreamer", "improvement_over_sac"), value("dreamer", "earlier_than_sac")),
+        (Some(0.8), Some(0.9))
+    );
+    assert_eq!((value("dreamer", "earlier_than_sac_low"), value("sac", "improvement_over_sac")), (Some(0.7), None));
+    assert_eq!(
+        (value("pets", "updates"), value("pets", "action_change"), value("pets", "optimism")),
+        (None, None, None)
+    );
     let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
@@ -252,6 +275,10 @@ fn a_summary_says_what_its_seeds_can_tell() {
         "takes at least 2.0 times as many steps",
         "**Not evaluated alike:** `dreamer` every 500 steps with 20 episodes",
         "`sac` every 1000 steps",
+        "| 0.80 [0.40, 1.00] | 0.90 [0.70, 1.00] |",
+        "- **no**: each learning method of a task has at least five seeds. Not: `pets` on `pole` has 2; `sac` on `pole` has 1.",
+        "- **no**: all learning methods of a task have the same seeds. Not: `pets` on `pole` without 2, 3, 4; `sac` on `pole` without 1, 2, 3, 4.",
+        "Not: it is not recorded.",
     ] {
         assert!(report.contains(part), "no `{part}` in: {report}");
     }

@@ -76,13 +76,13 @@ pub struct ImaginedTrajectory {
     pub disagreement: f32,
 }
 
-/// An estimate of the value at one time step of an episode, beside the return that followed.
+/// An estimate of the return from one time step of an episode on, beside the return that followed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ValueEstimate {
-    /// The estimate: the discounted sum of rewards from this time step on.
+    /// The estimate: of the discounted sum of rewards from this time step on, or of their sum over the horizon of a plan.
     pub expected: f32,
-    /// The discounted sum of the rewards that followed. After a truncation the return is bootstrapped from the estimate
-    /// at the last time step.
+    /// The same sum of the rewards that followed. After a truncation, the discounted sum is bootstrapped from the estimate at
+    /// the last time step.
     pub realised: f32,
 }
 
@@ -195,15 +195,22 @@ pub trait Checkpoint {
     }
 }
 
-/// How good an agent's model and critic are, measured on recorded episodes that it has not learned from. The defaults
-/// have nothing to measure.
+/// How good an agent's model and critic are, measured on recorded episodes that it has not learned from, and how much it has
+/// computed to learn them. The defaults have nothing to measure.
 pub trait Diagnostics {
+    /// Gradient steps so far: of the model if it has one, of the critics otherwise.
+    #[doc(alias = "gradient updates")]
+    fn updates(&self) -> u64 {
+        0
+    }
+
     /// The open-loop prediction error of its model, for several horizons.
     fn open_loop(&self, _episodes: &[Episode]) -> Vec<OpenLoop> {
         Vec::new()
     }
 
-    /// Its value estimates, beside the returns that followed.
+    /// Its value estimates, beside the returns that followed; of an agent that plans without values, the returns that its plans
+    /// predicted for their horizon.
     fn value_estimates(&self, _episodes: &[Episode]) -> Vec<ValueEstimate> {
         Vec::new()
     }

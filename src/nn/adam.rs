@@ -110,6 +110,11 @@ impl Adam {
         Self { slower: Some((prefix, factor)), ..self }
     }
 
+    /// How many steps it has made.
+    pub fn steps(&self) -> u64 {
+        self.steps.into()
+    }
+
     /// Changes the step size from the next step on.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.config.learning_rate = learning_rate;

@@ -44,6 +44,9 @@ pub struct EpisodeResult {
     pub sparc: Option<f64>,
     /// Log dimensionless jerk of the hand.
     pub ldlj: Option<f64>,
+    /// [`action_change`](smoothness::action_change) over the episode; none where there is one action only.
+    #[serde(default)]
+    pub action_change: Option<f64>,
 }
 
 /// What an evaluation has found so far.
@@ -177,7 +180,15 @@ impl<E: Env> Evaluator<E> {
         let mut observations = self.envs.reset(seeds)?;
         let count = seeds.len();
         let mut paths: Vec<Vec<[f64; 3]>> = (0..count).map(|i| self.envs.env(i).hand().into_iter().collect()).collect();
-        let blank = EpisodeResult { total: 0.0, success: false, length: 0, stage: 0, sparc: None, ldlj: None };
+        let blank = EpisodeResult {
+            total: 0.0,
+            success: false,
+            length: 0,
+            stage: 0,
+            sparc: None,
+            ldlj: None,
+            action_change: None,
+        };
         let mut results = vec![blank; count];
         let recorded = observations.iter().map(|obs| Episode { observations: vec![obs.clone()], ..Episode::default() });
         let mut recorded: Vec<Episode> = recorded.collect();
@@ -211,7 +222,8 @@ impl<E: Env> Evaluator<E> {
             }
         }
         let dt = self.envs.env(0).spec().dt;
-        for (result, path) in results.iter_mut().zip(&paths) {
+        for ((result, path), episode) in results.iter_mut().zip(&paths).zip(&recorded) {
+            result.action_change = smoothness::action_change(&episode.actions);
             if let Some((sparc, ldlj)) = smoothness::of_path(path, dt) {
                 (result.sparc, result.ldlj) = (Some(sparc), Some(ldlj));
             }

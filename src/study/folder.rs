@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -25,6 +27,21 @@ const LOCK: &str = ".lock";
 /// The note in a checkpoint, and in weights, that holds the run's configuration.
 const RUN: &str = "run";
 
+/// The version of this program, with the commit of its sources if they are in a repository of their own: what `git describe` says
+/// of them when the first run begins.
+static SOURCE: LazyLock<String> = LazyLock::new(|| {
+    let sources = env!("CARGO_MANIFEST_DIR");
+    let git = |arguments: &[&str]| -> Option<String> {
+        let said = Command::new("git").arg("-C").arg(sources).args(arguments).output().ok()?;
+        let text = String::from_utf8(said.stdout).ok()?;
+        said.status.success().then(|| text.trim().to_string())
+    };
+    let own = git(&["rev-parse", "--show-toplevel"]).is_some_and(|top| Path::new(&top) == Path::new(sources));
+    let commit = own.then(|| git(&["describe", "--always", "--dirty", "--abbrev=10"])).flatten();
+    let version = env!("CARGO_PKG_VERSION");
+    commit.map_or(version.into(), |commit| format!("{version} ({commit})"))
+});
+
 /// The folder of a run that is open. It is locked: no other process, and no other [`RunFolder`] in this one, writes there.
 pub(super) struct RunFolder {
     path: PathBuf,
@@ -38,6 +55,8 @@ impl RunFolder {
     /// # Errors
     /// If it is open elsewhere, holds another run, or cannot be written.
     pub fn claim(path: &Path, config: &RunConfig) -> Result<Self> {
+        // Before the sources can change under a run of hours.
+        LazyLock::force(&SOURCE);
         let folder = Self { path: path.into(), _lock: lock(path)? };
         let file = path.join(CONFIG);
         if file.exists() {
@@ -111,7 +130,8 @@ impl RunFolder {
         write_test(&self.path, test)?;
         let files = TABLES.into_iter().chain(config.learns().then_some(WEIGHTS));
         let checksums = files.map(|file| Ok((file.into(), checksum(&self.path.join(file))?)));
-        let completed = Completed { summary: test.summary(), checksums: checksums.collect::<Result<_>>()? };
+        let checksums = checksums.collect::<Result<_>>()?;
+        let completed = Completed { version: SOURCE.clone(), summary: test.summary(), checksums };
         let completed = toml::to_string(&completed).expect("a summary is TOML");
         files::write(&self.path.join(SUMMARY), completed.as_bytes())
     }
@@ -120,6 +140,9 @@ impl RunFolder {
 /// What a run's `summary.toml` holds.
 #[derive(Serialize, Deserialize)]
 struct Completed {
+    /// The version of the program that completed it; earlier ones did not say.
+    #[serde(default)]
+    version: String,
     #[serde(flatten)]
     summary: Summary,
     /// CRC-32 of each other file that it ended with; the first edition wrote none.
@@ -160,6 +183,12 @@ pub fn is_complete(folder: &Path, config: &RunConfig) -> bool {
 /// If there are none, or they are damaged.
 pub fn read_summary(folder: &Path) -> Result<Summary> {
     Ok(Completed::read(folder)?.summary)
+}
+
+/// The version of the program that completed the run in a folder; empty if that is not known.
+#[cfg(feature = "study")]
+pub(super) fn version(folder: &Path) -> String {
+    Completed::read(folder).map(|run| run.version).unwrap_or_default()
 }
 
 /// # Errors
@@ -241,7 +270,7 @@ pub(super) fn is_open(folder: &Path) -> bool {
 }
 
 /// The first setting in which two configurations differ.
-fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
+pub(super) fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
     difference_in("", &there.to_table(), &wanted.to_table())
 }
 

@@ -45,6 +45,8 @@ mod folder;
 mod names;
 #[cfg(feature = "study")]
 mod page;
+#[cfg(feature = "study")]
+mod provenance;
 pub mod records;
 pub mod registry;
 #[cfg(feature = "study")]

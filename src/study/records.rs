@@ -16,11 +16,20 @@ use crate::model::open_loop::OpenLoop;
 const LOSSES_EVERY: usize = 500;
 
 const EPISODE_COLUMNS: [&str; 6] = ["step", "episode", "return", "success", "length", "seconds"];
-const EVALUATION_COLUMNS: [&str; 8] =
-    ["step", "episodes", "success", "return_mean", "return_std", "smoothness_sparc", "smoothness_ldlj", "action_ms"];
+const EVALUATION_COLUMNS: [&str; 9] = [
+    "step",
+    "episodes",
+    "success",
+    "return_mean",
+    "return_std",
+    "smoothness_sparc",
+    "smoothness_ldlj",
+    "action_ms",
+    "updates",
+];
 const MODEL_COLUMNS: [&str; 6] = ["step", "horizon", "rmse", "nll", "coverage90", "rmse_p90"];
 const VALUE_COLUMNS: [&str; 5] = ["step", "expected", "realised", "rmse", "correlation"];
-const TEST_COLUMNS: [&str; 7] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj"];
+const TEST_COLUMNS: [&str; 8] = ["episode", "return", "success", "length", "stage", "sparc", "ldlj", "action_change"];
 
 /// The tables that a complete run has.
 pub(super) const TABLES: [&str; 6] =
@@ -52,6 +61,9 @@ pub struct EvaluationRow {
     /// What was measured.
     #[serde(flatten)]
     pub summary: Summary,
+    /// Gradient steps so far; earlier versions did not count them.
+    #[serde(default)]
+    pub updates: u64,
 }
 
 /// A row of `losses.csv`: the mean of one loss over the last steps.
@@ -75,7 +87,8 @@ pub struct ModelRow {
     pub open_loop: OpenLoop,
 }
 
-/// A row of `values.csv`: the agent's value estimates in the last evaluation's episodes, and the returns that followed.
+/// A row of `values.csv`: the returns that the agent expected in the last evaluation's episodes (values, or what plans predict
+/// for their horizon), and those that followed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueRow {
     /// Environment steps so far.
@@ -157,9 +170,9 @@ impl Progress {
         write_csv(&folder.join("values.csv"), &VALUE_COLUMNS, values.iter())?;
         write_csv(&folder.join("episodes.csv"), &EPISODE_COLUMNS, episodes.iter())?;
         // Without the interval of the success rate, which follows from the rate and the episodes.
-        let evaluations = evaluations.iter().map(|EvaluationRow { step, summary: s }| {
+        let evaluations = evaluations.iter().map(|EvaluationRow { step, summary: s, updates }| {
             let smoothness = (s.smoothness_sparc, s.smoothness_ldlj);
-            (step, s.episodes, s.success, s.return_mean, s.return_std, smoothness, s.action_ms)
+            (step, s.episodes, s.success, s.return_mean, s.return_std, smoothness, s.action_ms, updates)
         });
         write_csv(&folder.join("evaluations.csv"), &EVALUATION_COLUMNS, evaluations)?;
         write_csv(&folder.join("losses.csv"), &["step", "name", "value"], losses.iter())

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use super::figures;
 use super::page;
+use super::provenance;
 use super::starts::Starts;
 use super::tables::{BASELINE, Curve, LEVEL, Tables};
 use super::verdict::verdict;
@@ -54,12 +55,25 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
          choosing an action takes in the last evaluation. SPARC, LDLJ: smoothness of the hand's movement; closer to zero is smoother.\n",
         100.0 * LEVEL
     );
+    text += &format!(
+        "\nIn the tables of the tasks, area under the curve is the mean success rate up to the smallest budget; action change the root mean square \
+         change from one action to the next in the test; optimism the return that was expected (a value, or what a plan predicts for its horizon) less \
+         the return that followed, over the size of the latter, in the last evaluation, and correlation that of the two over time steps; better and \
+         earlier the probability that a seed has more success in the test than one of `{BASELINE}`, or reaches {:.0} % by an earlier step.\n",
+        100.0 * LEVEL
+    );
     for task in &tasks {
         let (curves, tests) = (format!("{task}-learning.svg"), format!("{task}-test.svg"));
         write!(text, "\n## {task}\n\n").expect("text grows");
         text += &findings(&tables, task)?;
+        text += &details(&tables, task)?;
         if figures::learning_curves(&tables, task, &to.join(&curves))? {
             write!(text, "\n![Success rate of each method on {task} over environment steps]({curves})\n")
+                .expect("text grows");
+        }
+        let profile = format!("{task}-profile.svg");
+        if figures::profile(&tables, task, &to.join(&profile))? {
+            write!(text, "\n![Share of each method's seeds above each success rate on {task}, and success over seconds of training]({profile})\n")
                 .expect("text grows");
         }
         figures::tests(&tables, task, &to.join(&tests))?;
@@ -77,7 +91,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
             }
             let file = format!("{stem}-values.svg");
             if figures::values(&tables, task, method, &to.join(&file))? {
-                write!(text, "\n![Value estimated by {method} on {task} over environment steps, and the return that followed]({file})\n")
+                write!(text, "\n![Return that {method} expected on {task} over environment steps, and the return that followed]({file})\n")
                     .expect("text grows");
             }
             match tables.left_out(task, method)? {
@@ -90,6 +104,18 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     }
     text += "\n## How certain is this?\n\n";
     text += &caveat(&tables, &pairs)?;
+    let mut not_alike = Vec::new();
+    for task in &tasks {
+        if !different_grids(&tables, task)?.is_empty() {
+            not_alike.push(*task);
+        }
+    }
+    text += "\n## Checklist\n\n";
+    text += &provenance::checklist(&tables, &not_alike)?;
+    let configurations = provenance::configurations(&tables)?;
+    if !configurations.is_empty() {
+        text += &format!("\n## Configurations\n{configurations}");
+    }
     files::write(&to.join("report.md"), text.as_bytes())?;
     files::write(&to.join("report.html"), page::page(&text, to)?.as_bytes())?;
     Ok(tuning_note(&tables)?.to_string() + &text_table(&rows(&tables)?))
@@ -194,6 +220,43 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
         text.push('\n');
     }
     Ok(text + &different_grids(tables, task)?)
+}
+
+/// The numbers of the methods that learn a task which the first table has no room for.
+fn details(tables: &Tables, task: &str) -> Result<String> {
+    let mut rows = String::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        let value = |column: &str| tables.value(task, &method, column);
+        if value("steps")?.is_none() {
+            continue;
+        }
+        let show = |column: &str, text: fn(f64) -> String| value(column).map(|found| found.map_or("-".into(), text));
+        let beside = |column: &str| -> Result<String> {
+            let [low, high] = [value(&format!("{column}_low"))?, value(&format!("{column}_high"))?];
+            Ok(match (value(column)?, low, high) {
+                (Some(p), Some(low), Some(high)) => format!("{p:.2} [{low:.2}, {high:.2}]"),
+                _ => "-".into(),
+            })
+        };
+        rows += &format!(
+            "| {method} | {} | {} | {} | {} | {} | {} | {} |\n",
+            show("area_under_curve", |area| format!("{area:.2}"))?,
+            show("updates", |updates| format!("{updates:.0}"))?,
+            show("action_change", |change| format!("{change:.2}"))?,
+            show("optimism", |share| format!("{:+.0} %", 100.0 * share))?,
+            show("return_correlation", |correlation| format!("{correlation:.2}"))?,
+            beside("improvement_over_sac")?,
+            beside("earlier_than_sac")?,
+        );
+    }
+    if rows.is_empty() {
+        return Ok(rows);
+    }
+    Ok(format!(
+        "\n| method | area under the curve | gradient updates | action change | optimism | correlation | better than `{BASELINE}` | earlier than `{BASELINE}` |\n\
+         |{}\n{rows}",
+        " --- |".repeat(8)
+    ))
 }
 
 /// The comparison of a method with [`BASELINE`], if both learn the task.

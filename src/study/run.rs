@@ -209,8 +209,9 @@ impl<E: Env> Run<E> {
         let (step, episodes) = (self.progress.step, self.config.evaluation_episodes);
         check_weights(&self.method.checkpoint().weights(), step)?;
         let evaluation = self.evaluator.evaluate(&mut self.method, episodes, self.config.starts.curve())?;
-        let row = EvaluationRow { step, summary: evaluation.summary() };
+        let mut row = EvaluationRow { step, summary: evaluation.summary(), updates: 0 };
         if let Some(agent) = self.method.as_learner() {
+            row.updates = agent.updates();
             let open_loop = agent.open_loop(&evaluation.episodes).into_iter();
             self.progress.model.extend(open_loop.map(|open_loop| ModelRow { step, open_loop }));
             self.progress.values.extend(ValueRow::new(step, &agent.value_estimates(&evaluation.episodes)));

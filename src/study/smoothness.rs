@@ -1,4 +1,4 @@
-//! Smoothness of a movement: SPARC and LDLJ.
+//! Smoothness of a movement: SPARC and LDLJ; and of the actions that made it.
 //!
 //! [`of_path`] measures the movement alone: the part between the first and the last time step at which the hand is faster
 //! than a twentieth of its top speed.
@@ -16,6 +16,8 @@
 
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex;
+
+use super::statistics::mean;
 
 /// Speeds below this fraction of the top speed count as rest.
 const REST: f64 = 0.05;
@@ -39,6 +41,16 @@ pub fn of_path(path: &[[f64; 3]], dt: f64) -> Option<(f64, f64)> {
     let first = speed.iter().position(|v| moving(&v))?;
     let last = speed.iter().rposition(|v| moving(&v))?;
     (last - first >= 3).then(|| (sparc(&speed[first..=last], 1.0 / dt), ldlj(&velocity[first..=last], 1.0 / dt)))
+}
+
+/// Root mean square change from one action to the next, over their numbers and the time steps: 0 for actions that never change,
+/// 2 for those that jump from end to end of their range. None for fewer than two actions.
+#[doc(alias = "action smoothness")]
+pub fn action_change(actions: &[Vec<f32>]) -> Option<f64> {
+    let changes =
+        actions.windows(2).flat_map(|pair| pair[0].iter().zip(&pair[1]).map(|(a, b)| f64::from(b - a).powi(2)));
+    let squares: Vec<f64> = changes.collect();
+    (!squares.is_empty()).then(|| mean(&squares).sqrt())
 }
 
 fn norm(v: &[f64; 3]) -> f64 {

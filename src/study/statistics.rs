@@ -185,6 +185,43 @@ pub fn paired_difference(first: &[Vec<f64>], second: &[Vec<f64>], rng: &mut Rng)
     (observed, interval)
 }
 
+/// The probability of improvement: that a run of the first method has a larger value than one of the second, over all pairs of
+/// runs, a tie counting half; and its 95 % bootstrap interval over the runs of both.
+///
+/// Agarwal et al. (NeurIPS 2021), who average it over tasks. It is Mann & Whitney's U over the number of pairs.
+///
+/// # Panics
+/// If one has no runs.
+#[doc(alias = "Mann-Whitney")]
+#[doc(alias = "common language effect size")]
+pub fn probability_of_improvement(first: &[f64], second: &[f64], rng: &mut Rng) -> (f64, [f64; 2]) {
+    let share = |first: &[f64], second: &[f64]| {
+        let won = |a: &f64| second.iter().map(|b| if a > b { 1.0 } else { f64::from(a == b) / 2.0 }).sum::<f64>();
+        first.iter().map(won).sum::<f64>() / (first.len() * second.len()) as f64
+    };
+    let interval = percentiles(|| {
+        let drawn = |values: &[f64], rng: &mut Rng| resample(values, rng).copied().collect::<Vec<f64>>();
+        share(&drawn(first, rng), &drawn(second, rng))
+    });
+    (share(first, second), interval)
+}
+
+/// The performance profile: for each threshold, the share of runs with a larger value.
+///
+/// Dolan & Moré, "Benchmarking optimization software with performance profiles", Mathematical Programming 91 (2002); of scores
+/// and not of times as in Agarwal et al. (NeurIPS 2021).
+///
+/// ```
+/// use handful::study::statistics::performance_profile;
+///
+/// assert_eq!(performance_profile(&[0.2, 0.9, 1.0, 0.9], &[0.0, 0.5, 0.9]), [1.0, 0.75, 0.25]);
+/// ```
+#[doc(alias = "score distribution")]
+pub fn performance_profile(values: &[f64], thresholds: &[f64]) -> Vec<f64> {
+    let share = |threshold: &f64| values.iter().filter(|value| *value > threshold).count() as f64 / values.len() as f64;
+    thresholds.iter().map(share).collect()
+}
+
 /// The area under a success curve (trapezoidal rule) up to `budget` environment steps, divided by its length: the mean
 /// success rate until then. Methods are compared over the same budget. Not a number for a curve that does not reach it.
 #[doc(alias = "AUC")]

@@ -4,7 +4,7 @@ use polars::prelude::*;
 
 use super::statistics::{
     IQM_RUNS, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
-    ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
+    probability_of_improvement, ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
 };
 use super::tables::{BASELINE, Curve, LEVEL, by_run, curves, lists, of, strings};
 use crate::rng::{self, Rng};
@@ -21,13 +21,19 @@ struct Runs {
     clocks: Vec<Curve>,
     /// For each seed, the milliseconds that an action takes in each evaluation; the same.
     action_ms: Vec<Curve>,
+    /// For each seed, the gradient steps until each evaluation; the same.
+    updates: Vec<Curve>,
+    /// For each seed, the expected returns in each evaluation, those that followed, and the correlation of the two.
+    expectations: [Vec<Curve>; 3],
     /// Columns of the test whose mean is taken over all episodes.
     means: Vec<(&'static str, Option<f64>)>,
 }
 
 /// One row per task and method, in the order in which they were run.
-pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFrame> {
-    let tests = by_run(tests.clone().lazy(), &["success", "return", "length", "sparc", "ldlj"])?;
+pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &DataFrame) -> PolarsResult<DataFrame> {
+    let measures = ["success", "return", "length", "sparc", "ldlj", "action_change"];
+    let there: Vec<&str> = measures.into_iter().filter(|name| tests.column(name).is_ok()).collect();
+    let tests = by_run(tests.clone().lazy(), &there)?;
     let pairs = tests.clone().lazy().select([col("task"), col("method")]);
     let pairs = pairs.unique_stable(None, UniqueKeepStrategy::First).collect()?;
     let mut all = Vec::new();
@@ -39,7 +45,11 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
             ("length", "length_mean"),
             ("sparc", "smoothness_sparc"),
             ("ldlj", "smoothness_ldlj"),
+            ("action_change", "action_change"),
         ] {
+            if !there.contains(&column) {
+                continue;
+            }
             let known: Vec<f64> = lists(&rows, column)?.concat().into_iter().filter(|x| x.is_finite()).collect();
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
@@ -48,8 +58,11 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
             Ok(_) => curves(evaluations, &task, &method, column),
             Err(_) => Ok(Vec::new()),
         };
-        let [curves, clocks, action_ms] = [over_steps("success")?, over_steps("seconds")?, over_steps("action_ms")?];
-        all.push(Runs { task, method, success, curves, clocks, action_ms, means });
+        let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
+        let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
+        let of_values = |column: &str| self::curves(values, &task, &method, column);
+        let expectations = [of_values("expected")?, of_values("realised")?, of_values("correlation")?];
+        all.push(Runs { task, method, success, curves, clocks, action_ms, updates, expectations, means });
     }
     let names = |of: fn(&Runs) -> &String| all.iter().map(|runs| of(runs).clone()).collect::<Vec<String>>();
     let mut columns =
@@ -67,7 +80,7 @@ pub(super) fn summarise(evaluations: &DataFrame, tests: &DataFrame) -> PolarsRes
 }
 
 /// The columns after task and method. Scripts read them by name: new ones are added at the end, none is removed.
-const SUMMARY: [&str; 28] = [
+const SUMMARY: [&str; 38] = [
     "seeds",
     "steps",
     "test_episodes",
@@ -96,6 +109,16 @@ const SUMMARY: [&str; 28] = [
     "sac_steps_ratio_high",
     "seconds_to_80",
     "action_ms",
+    "updates",
+    "action_change",
+    "optimism",
+    "return_correlation",
+    "improvement_over_sac",
+    "improvement_over_sac_low",
+    "improvement_over_sac_high",
+    "earlier_than_sac",
+    "earlier_than_sac_low",
+    "earlier_than_sac_high",
 ];
 
 /// The stream of every bootstrap: the tables alone decide its result.
@@ -125,7 +148,7 @@ impl Runs {
     }
 
     fn row(&self, all: &[Self]) -> Vec<(&'static str, Option<f64>)> {
-        let by_seed: Vec<f64> = self.success.iter().map(|episodes| mean(episodes)).collect();
+        let by_seed = self.by_seed();
         let episodes = self.success.concat();
         let [low, high] = success_interval(&self.success);
         let mut row = self.means.clone();
@@ -158,8 +181,12 @@ impl Runs {
             if !self.clocks.is_empty() {
                 row.push(("seconds_to_80", censored_median(&self.seconds())));
             }
-            let last: Vec<f64> = self.action_ms.iter().filter_map(|(_, ms)| ms.last().copied()).collect();
-            row.push(("action_ms", Some(mean(&last))));
+            row.push(("action_ms", Some(mean(&last_of_each(&self.action_ms)))));
+            row.push(("updates", Some(mean(&last_of_each(&self.updates)))));
+            let [expected, realised, correlation] =
+                self.expectations.each_ref().map(|curves| mean(&last_of_each(curves)));
+            row.push(("optimism", Some((expected - realised) / realised.abs())));
+            row.push(("return_correlation", Some(correlation)));
             let areas: Vec<f64> = self.curves.iter().map(|(x, y)| area_under_curve(x, y, common)).collect();
             row.extend([
                 ("steps_to_80", censored_median(&times)),
@@ -176,6 +203,11 @@ impl Runs {
         row
     }
 
+    /// The success rate of each seed.
+    fn by_seed(&self) -> Vec<f64> {
+        self.success.iter().map(|episodes| mean(episodes)).collect()
+    }
+
     /// The comparison with the baseline's runs on the same task.
     fn against(&self, baseline: &Self) -> Vec<(&'static str, Option<f64>)> {
         let (difference, [low, high]) = paired_difference(&self.success, &baseline.success, &mut stream());
@@ -184,6 +216,19 @@ impl Runs {
             ("success_minus_sac_low", Some(low)),
             ("success_minus_sac_high", Some(high)),
         ];
+        // Who never gets there gets there last.
+        let sooner = |runs: &Self| runs.times().iter().map(|time| -time.unwrap_or(f64::INFINITY)).collect::<Vec<f64>>();
+        for (entries, first, second) in [
+            (
+                ["improvement_over_sac", "improvement_over_sac_low", "improvement_over_sac_high"],
+                self.by_seed(),
+                baseline.by_seed(),
+            ),
+            (["earlier_than_sac", "earlier_than_sac_low", "earlier_than_sac_high"], sooner(self), sooner(baseline)),
+        ] {
+            let (probability, [low, high]) = probability_of_improvement(&first, &second, &mut stream());
+            row.extend(entries.into_iter().zip([probability, low, high].map(Some)));
+        }
         // With a censored seed of this method, the ratio would be neither an estimate nor a bound; with one of the baseline's,
         // which counts as its budget, it is a lower bound, and its interval has no upper end.
         if let Some(times) = self.times().into_iter().collect::<Option<Vec<f64>>>() {
@@ -196,6 +241,11 @@ impl Runs {
         }
         row
     }
+}
+
+/// The last value of each curve.
+fn last_of_each(curves: &[Curve]) -> Vec<f64> {
+    curves.iter().filter_map(|(_, values)| values.last().copied()).collect()
 }
 
 /// The 95 % interval of a success rate. One seed: Wilson's, of this agent. Several: the two-level bootstrap; but if all

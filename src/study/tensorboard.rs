@@ -57,6 +57,7 @@ fn events(progress: &Progress, began: f64) -> Vec<u8> {
         scalars.push((row.step, "evaluation/success".into(), summary.success));
         scalars.push((row.step, "evaluation/return".into(), summary.return_mean));
         scalars.push((row.step, "evaluation/ms_per_action".into(), summary.action_ms));
+        scalars.push((row.step, "evaluation/updates".into(), row.updates as f64));
         let smoothness = summary.smoothness_sparc.into_iter();
         scalars.extend(smoothness.map(|sparc| (row.step, "evaluation/sparc".into(), sparc)));
     }

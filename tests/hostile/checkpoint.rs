@@ -2,7 +2,7 @@
 
 use std::cell::Cell;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use handful::checkpoint::Weights;
@@ -142,6 +142,46 @@ fn what_a_finished_run_lost_comes_back() {
     fs::remove_file(here.join(STATE)).expect("a writable folder");
     fs::remove_file(here.join("values.csv")).expect("a writable folder");
     assert!(is_complete(here, &config));
+}
+
+/// Runs that cannot be used are in no table, and the report names each with the reason.
+#[test]
+fn runs_that_cannot_be_used_are_left_out_by_name() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let study = folder.path().join("study");
+    let run = |name: &str, config: &RunConfig| {
+        let place = folder.path().join(name);
+        finish(config, &place).expect("a healthy run");
+        place
+    };
+    let mut runs: Vec<PathBuf> = (0..3).map(|seed| run(&format!("seed{seed}"), &small("small-sac", seed))).collect();
+    let whole = fs::read(runs[1].join("test.csv")).expect("a table");
+    fs::write(runs[1].join("test.csv"), &whole[..whole.len() / 2]).expect("a writable folder");
+    let other = RunConfig { evaluation_episodes: 3, ..small("small-sac", 3) };
+    runs.extend([run("other", &other), runs[0].clone(), folder.path().join("nothing")]);
+    let gathered = Tables::gather(runs.iter().map(PathBuf::as_path)).expect("two healthy runs");
+    gathered.write(&study).expect("a writable folder");
+    handful::study::report::write(&study, &study).expect("a report");
+    let tables = Tables::read(&study).expect("the tables");
+    let seeds = tables.seeds_of_learners().expect("the tables").into_values().next().expect("a method");
+    assert_eq!(seeds.into_iter().collect::<Vec<_>>(), [0, 2]);
+    let configurations = tables.runs().expect("the tables");
+    let written = fs::read_to_string(runs[2].join("config.toml")).expect("a configuration");
+    assert_eq!(configurations[1].configuration.trim(), written.trim());
+    let report = fs::read_to_string(study.join("report.md")).expect("a report");
+    for part in [
+        "**no**: no run is left out. Not: `",
+        "seed1/test.csv: it was lost or changed after the run had ended",
+        "with seed 3 has another configuration than with seed 0 (its  evaluation_episodes  is ",
+        "with seed 0 is there twice",
+        "nothing/config.toml",
+        ": seeds 0, 2; version 0.",
+    ] {
+        assert!(report.contains(part), "no `{part}` in: {report}");
+    }
+    // The next attempt finds nothing to complain of.
+    Tables::gather([runs[0].as_path()]).expect("a healthy run").write(&study).expect("a writable folder");
+    assert!(!study.join("left_out.csv").exists());
 }
 
 /// Arrays, by their places, and what becomes of them. The checksum is right: somebody made this file.

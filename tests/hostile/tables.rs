@@ -495,3 +495,36 @@ fn other_ways_to_write_a_table_are_read() {
     let header = |table: usize| quick.0[table].split_inclusive(|byte| *byte == b'\n').next().expect("a header");
     assert_eq!(bare(b"", b""), bare(header(1), header(2)));
 }
+
+/// What the tables of the runs say is quoted in the report, and does nothing there.
+#[test]
+fn configurations_and_reasons_are_quoted() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let write = |name: &str, text: String| std::fs::write(folder.path().join(name), text).expect("a writable folder");
+    let evil = "</details><script>alert(1)</script>`**\n\n# h\n```\n";
+    write(
+        "tests.csv",
+        "task,method,seed,episode,return,success,length,stage,sparc,ldlj\na,b,0,1,1,true,9,0,,\n".into(),
+    );
+    for empty in ["evaluations.csv", "models.csv", "values.csv"] {
+        write(empty, String::new());
+    }
+    write("runs.csv", format!("task,method,seed,version,configuration\na,b,0,\"{evil}\",\"{evil}\"\n"));
+    write("left_out.csv", format!("run,reason\n\"{evil}\",\"{evil}\"\n"));
+    report::write(folder.path(), folder.path()).expect("a report");
+    let page = std::fs::read_to_string(folder.path().join("report.html")).expect("a page");
+    assert!(!page.contains("<script") && page.matches("</details>").count() == 1, "{page}");
+    assert!(!page.contains("<h1>h") && page.contains("&lt;script&gt;alert(1)"), "{page}");
+    for (file, text, problem) in [
+        ("runs.csv", "task,method,seed,version\na,b,0,1\n", "no column `configuration`"),
+        ("runs.csv", "task,method,seed,version,configuration\na,b,0,1,c\na,b,0,1,c\n", "a row is doubled"),
+        ("runs.csv", "task,method,seed,version,configuration\na,c,0,1,c\n", "is not in its tests"),
+        ("left_out.csv", "run\na\n", "no column `reason`"),
+    ] {
+        let before = std::fs::read(folder.path().join(file)).expect("a table");
+        write(file, text.into());
+        let found = report::write(folder.path(), folder.path()).expect_err(problem).to_string();
+        assert!(found.contains(problem), "{found}");
+        std::fs::write(folder.path().join(file), before).expect("a writable folder");
+    }
+}

@@ -213,6 +213,10 @@ impl Agent for Dreamer {
 }
 
 impl Diagnostics for Dreamer {
+    fn updates(&self) -> u64 {
+        self.optimiser.steps()
+    }
+
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         let model = OfDecisions { model: &self.networks.world, action_repeat: self.config.action_repeat };
         open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))

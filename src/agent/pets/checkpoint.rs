@@ -1,20 +1,9 @@
-//! What is saved of PETS, and how good its model is.
+//! What is saved of PETS.
 
 use super::Pets;
-use crate::agent::{Checkpoint, Diagnostics};
+use crate::agent::Checkpoint;
 use crate::checkpoint::Weights;
 use crate::error::Result;
-use crate::model::open_loop::{OpenLoop, Propagated, open_loop};
-use crate::replay::Episode;
-use crate::rng;
-
-impl Diagnostics for Pets {
-    fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
-        let Some(dynamics) = &self.dynamics else { return Vec::new() };
-        let model = Propagated { dynamics, propagation: self.config.propagation };
-        open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))
-    }
-}
 
 impl Checkpoint for Pets {
     fn weights(&self) -> Weights {

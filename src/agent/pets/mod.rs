@@ -22,6 +22,7 @@
 mod checkpoint;
 mod config;
 mod controller;
+mod diagnostics;
 mod objective;
 
 use std::sync::Arc;

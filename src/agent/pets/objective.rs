@@ -41,7 +41,7 @@ pub(super) struct PlanningModel<'a> {
     pub(super) config: &'a PetsConfig,
     dynamics: &'a Dynamics,
     /// None if the ensemble has learned it.
-    reward: Option<&'a DynReward>,
+    pub(super) reward: Option<&'a DynReward>,
     /// The terminal value: of a plan's last state.
     terminal: Option<Box<Value<'a>>>,
 }

@@ -12,6 +12,10 @@ use crate::nn::{Grad, ops, tensor};
 use crate::replay::Episode;
 
 impl Diagnostics for Sac {
+    fn updates(&self) -> u64 {
+        self.critic_optimiser.steps()
+    }
+
     fn value_estimates(&self, episodes: &[Episode]) -> Vec<ValueEstimate> {
         let of_episode = |episode: &Episode| {
             let episode = &in_decisions(episode, self.config.action_repeat);

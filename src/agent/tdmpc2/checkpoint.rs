@@ -13,6 +13,10 @@ use crate::replay::Episode;
 use crate::rng;
 
 impl Diagnostics for TdMpc2 {
+    fn updates(&self) -> u64 {
+        self.model_optimiser.steps()
+    }
+
     /// Predictions are those of the latent dynamics, read out by the probe.
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         let Networks { model, probe, .. } = &self.networks;

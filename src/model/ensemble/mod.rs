@@ -179,6 +179,11 @@ impl Ensemble {
         Ok(())
     }
 
+    /// Gradient steps so far, of the member that has made most.
+    pub fn updates(&self) -> u64 {
+        self.members.iter().map(|member| member.optimiser.steps()).max().unwrap_or(0)
+    }
+
     /// Adds the state of the optimisers to `state`.
     pub fn save_training_state(&self, state: &mut Weights) {
         for (i, member) in self.members.iter().enumerate() {

@@ -11,10 +11,12 @@ use crate::error::Result;
 use crate::files;
 
 mod learning;
+mod profile;
 mod test;
 mod training;
 
 pub use learning::learning_curves;
+pub use profile::profile;
 pub use test::tests;
 pub use training::{model, values};
 

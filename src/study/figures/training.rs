@@ -47,7 +47,8 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
     Ok(true)
 }
 
-/// A method's estimated value over training, beside the discounted return that followed. Returns `false`, and draws
+/// The return that a method expects over training (its estimated value, or what its plans predict for their horizon), beside
+/// the return that followed. Returns `false`, and draws
 /// nothing, if the method estimates none.
 ///
 /// # Errors
@@ -63,7 +64,7 @@ pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<
     let (low, high) = (all.clone().fold(0.0, f64::min), all.fold(0.0, f64::max));
     let (low, high) = (1.05 * low, 1.05 * high.max(low + 1e-3));
     let both = [
-        (PALETTE[0], "estimated value".to_string(), estimated),
+        (PALETTE[0], "expected return".to_string(), estimated),
         (PALETTE[1], "return that followed".to_string(), followed),
     ];
     let means = over_training("mean over time steps", &both)
@@ -72,7 +73,7 @@ pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<
     let correlation = [(PALETTE[2], "over time steps".to_string(), correlation)];
     let correlation =
         over_training("correlation of the two", &correlation).between(-0.3, 1.03).y_ticks(11, tenths).mark(1.0);
-    let title = format!("{task}: value estimated by {method}, and the discounted return that followed");
+    let title = format!("{task}: return that {method} expected, and the return that followed");
     save(&Panels::new(&title).panel(means).panel(correlation), path)?;
     Ok(true)
 }

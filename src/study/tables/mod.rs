@@ -2,21 +2,22 @@
 //! Everything else (`summary.csv` with one row per task and method, the figures, the report) is computed from these files
 //! alone.
 
-use std::collections::BTreeSet;
+use std::io::ErrorKind;
 use std::path::Path;
 
 use polars::prelude::*;
 
+mod gather;
 mod read;
+mod runs;
 
-use super::config::RunConfig;
-use super::folder::check_tables;
 use super::starts::Starts;
 use super::summary::summarise;
 use crate::chart::LARGEST;
 use crate::error::{Error, Result};
 use crate::files;
-use read::TableFormat;
+pub use runs::Run;
+use runs::check_runs;
 
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
@@ -41,79 +42,45 @@ pub struct Tables {
     pub values: DataFrame,
     /// task, method, seed, episode, return, success, ..., starts: one row per test episode.
     pub tests: DataFrame,
+    /// task, method, seed, version, configuration: one row per run, with the version of the program that made it, and its
+    /// configuration as TOML. Studies of earlier versions do not have this table.
+    pub runs: DataFrame,
+    /// run, reason: the folders of runs that are in no table, and why.
+    pub left_out: DataFrame,
     /// One row per task and method, computed from the other tables.
     pub summary: DataFrame,
 }
 
 impl Tables {
-    /// Collects the tables from the folders of runs.
-    ///
-    /// # Errors
-    /// If a run's files are missing or damaged, or some runs were tested on the test's starts and others on development
-    /// starts.
-    pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
-        let (mut evaluations, mut tests) = (Vec::new(), Vec::new());
-        let (mut models, mut values) = (Vec::new(), Vec::new());
-        let mut seen = BTreeSet::new();
-        for folder in folders {
-            let config = RunConfig::read(&folder.join("config.toml"))?;
-            if !seen.insert((config.task.clone(), config.method.clone(), config.seed, config.starts.name())) {
-                let problem =
-                    format!("`{}` on `{}` with seed {} is there twice", config.method, config.task, config.seed);
-                return Err(Error::data(folder)(problem));
-            }
-            check_tables(folder)?;
-            let label = |frame: DataFrame| {
-                frame.lazy().select([
-                    lit(config.task.as_str()).alias("task"),
-                    lit(config.method.as_str()).alias("method"),
-                    lit(config.seed).alias("seed"),
-                    all().as_expr(),
-                ])
-            };
-            let labelled = |file: &str, format: &TableFormat| -> Result<LazyFrame> {
-                Ok(label(read::of_run(&folder.join(file), format)?))
-            };
-            tests.push(labelled("test.csv", &read::TESTS)?.with_column(lit(config.starts.name()).alias("starts")));
-            if config.learns() {
-                let rows = read::of_run(&folder.join("evaluations.csv"), &read::EVALUATIONS)?;
-                let episodes = read::of_run(&folder.join("episodes.csv"), &read::EPISODES)?;
-                evaluations.push(label(with_seconds(rows, &episodes).map_err(inside)?));
-            }
-            for (file, format, frames) in
-                [("model.csv", &read::MODELS, &mut models), ("values.csv", &read::VALUES, &mut values)]
-            {
-                if folder.join(file).exists() {
-                    frames.push(labelled(file, format)?);
-                }
-            }
-        }
-        let join = |frames: Vec<LazyFrame>| {
-            let options = UnionArgs { to_supertypes: true, ..UnionArgs::default() };
-            if frames.is_empty() { Ok(DataFrame::empty()) } else { concat(frames, options)?.collect() }
-        };
-        let joined =
-            || -> PolarsResult<[DataFrame; 4]> { Ok([join(evaluations)?, join(models)?, join(values)?, join(tests)?]) };
-        Self::summarised(joined().map_err(inside)?)
-    }
-
     /// Reads the tables of a study from its folder.
     ///
     /// # Errors
     /// If one is missing or damaged, or the starts of the tests differ.
     pub fn read(folder: &Path) -> Result<Self> {
-        Self::summarised([
-            read::of_study(&folder.join("evaluations.csv"), &read::EVALUATIONS)?,
-            read::of_study(&folder.join("models.csv"), &read::MODELS)?,
-            read::of_study(&folder.join("values.csv"), &read::VALUES)?,
-            read::of_study(&folder.join("tests.csv"), &read::TESTS)?,
-        ])
+        let optional = |file: &str, read: &dyn Fn(&Path) -> Result<DataFrame>| {
+            let path = folder.join(file);
+            if path.exists() { read(&path) } else { Ok(DataFrame::empty()) }
+        };
+        Self::summarised(
+            [
+                read::of_study(&folder.join("evaluations.csv"), &read::EVALUATIONS)?,
+                read::of_study(&folder.join("models.csv"), &read::MODELS)?,
+                read::of_study(&folder.join("values.csv"), &read::VALUES)?,
+                read::of_study(&folder.join("tests.csv"), &read::TESTS)?,
+            ],
+            optional("runs.csv", &|path| read::of_study(path, &read::RUNS))?,
+            optional("left_out.csv", &|path| read::of_run(path, &read::LEFT_OUT))?,
+        )
     }
 
-    fn summarised([evaluations, models, values, tests]: [DataFrame; 4]) -> Result<Self> {
-        check_runs(&evaluations, [&models, &values], &tests)?;
-        let summary = summarise(&evaluations, &tests).map_err(inside)?;
-        let tables = Self { evaluations, models, values, tests, summary };
+    fn summarised(
+        [evaluations, models, values, tests]: [DataFrame; 4],
+        runs: DataFrame,
+        left_out: DataFrame,
+    ) -> Result<Self> {
+        check_runs(&evaluations, [&models, &values, &runs], &tests)?;
+        let summary = summarise(&evaluations, &values, &tests).map_err(inside)?;
+        let tables = Self { evaluations, models, values, tests, runs, left_out, summary };
         tables.starts()?;
         Ok(tables)
     }
@@ -147,7 +114,17 @@ impl Tables {
         write(&folder.join("evaluations.csv"), &self.evaluations)?;
         write(&folder.join("models.csv"), &self.models)?;
         write(&folder.join("values.csv"), &self.values)?;
-        write(&folder.join("tests.csv"), &self.tests)
+        write(&folder.join("tests.csv"), &self.tests)?;
+        write(&folder.join("runs.csv"), &self.runs)?;
+        let left_out = folder.join("left_out.csv");
+        if self.left_out.width() > 0 {
+            return write(&left_out, &self.left_out);
+        }
+        // That of an earlier attempt.
+        match std::fs::remove_file(&left_out) {
+            Err(problem) if problem.kind() != ErrorKind::NotFound => Err(Error::io("remove", &left_out)(problem)),
+            _ => Ok(()),
+        }
     }
 
     /// Writes `summary.csv` into a folder.
@@ -170,6 +147,26 @@ impl Tables {
     /// If the table lacks a column.
     pub fn curves(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
         curves(&self.evaluations, task, method, "success").map_err(inside)
+    }
+
+    /// The same over environment steps: the seconds of training until each evaluation. Empty if the tables do not tell them.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn clocks(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
+        match self.evaluations.column("seconds") {
+            Ok(_) => curves(&self.evaluations, task, method, "seconds").map_err(inside),
+            Err(_) => Ok(Vec::new()),
+        }
+    }
+
+    /// The final test of a method: for each seed, 1 for each episode that succeeds, 0 for each other.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn successes(&self, task: &str, method: &str) -> Result<Vec<Vec<f64>>> {
+        let found = || lists(&of(&by_run(self.tests.clone().lazy(), &["success"])?, task, method)?, "success");
+        found().map_err(inside)
     }
 
     /// The evaluations of a method during training: for each seed, their steps, and the episodes of each.
@@ -236,15 +233,6 @@ impl Tables {
     }
 }
 
-/// The evaluations of a run, with the seconds of training until each: those of the last episode before it.
-fn with_seconds(mut evaluations: DataFrame, episodes: &DataFrame) -> PolarsResult<DataFrame> {
-    let ends: Vec<_> = numbers(episodes, "step")?.into_iter().zip(numbers(episodes, "seconds")?).collect();
-    let until = |step: Option<f64>| ends.iter().rev().find(|(end, _)| *end <= step).map_or(Some(0.0), |(_, s)| *s);
-    let seconds: Vec<Option<f64>> = numbers(&evaluations, "step")?.into_iter().map(until).collect();
-    evaluations.with_column(Column::new("seconds".into(), seconds))?;
-    Ok(evaluations)
-}
-
 pub(super) fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
     if frame.width() == 0 {
         return Ok(frame.clone());
@@ -291,44 +279,6 @@ fn write(path: &Path, table: &DataFrame) -> Result<()> {
         CsvWriter::new(&mut bytes).finish(&mut table.clone()).map_err(inside)?;
     }
     files::write(path, &bytes)
-}
-
-/// Every run was tested, and of a method that learns every run was evaluated.
-fn check_runs(evaluations: &DataFrame, others: [&DataFrame; 2], tests: &DataFrame) -> Result<()> {
-    let [evaluated, tested] = [evaluations, tests].map(|table| runs(table).map_err(inside));
-    let (evaluated, tested) = (evaluated?, tested?);
-    if tested.is_empty() {
-        return Err(Error::Config("the study has no test episode: there is nothing to report".into()));
-    }
-    let missing = |run: &(String, String, String), table: &str| {
-        let (task, method, seed) = run;
-        Err(Error::Config(format!(
-            "the study is incomplete: `{method}` on `{task}` with seed {seed} is not in its {table}"
-        )))
-    };
-    for table in [evaluations, others[0], others[1]] {
-        if let Some(run) = runs(table).map_err(inside)?.difference(&tested).next() {
-            return missing(run, "tests");
-        }
-    }
-    let learns = |(task, method, _): &&(String, String, String)| {
-        evaluated.iter().any(|(of, other, _)| (of, other) == (task, method))
-    };
-    match tested.difference(&evaluated).find(learns) {
-        Some(run) => missing(run, "evaluations"),
-        None => Ok(()),
-    }
-}
-
-/// Task, method and seed of each run in a table.
-fn runs(table: &DataFrame) -> PolarsResult<BTreeSet<(String, String, String)>> {
-    if table.width() == 0 {
-        return Ok(BTreeSet::new());
-    }
-    let seeds = table.column("seed")?.cast(&DataType::String)?;
-    let seeds = seeds.str()?.iter().map(|seed| seed.unwrap_or_default().to_string());
-    let names = strings(table, "task")?.into_iter().zip(strings(table, "method")?);
-    Ok(names.zip(seeds).map(|((task, method), seed)| (task, method, seed)).collect())
 }
 
 /// An error in tables that could be read.

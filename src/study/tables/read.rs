@@ -15,6 +15,8 @@ use crate::study::starts::{LIMIT, Starts};
 enum Cell {
     /// The name of a task or method.
     Name,
+    /// Any text.
+    Text,
     /// The name of a set of starts.
     Starts,
     /// A whole number from 0 on, below this limit.
@@ -68,6 +70,7 @@ pub(super) const EVALUATIONS: TableFormat = TableFormat {
         ("smoothness_sparc", Cell::Measure, Optional),
         ("smoothness_ldlj", Cell::Measure, Optional),
         ("action_ms", Cell::Number, Optional),
+        ("updates", MANY, Optional),
         ("seconds", Cell::Number, Optional),
     ],
     order: &["step"],
@@ -114,12 +117,22 @@ pub(super) const TESTS: TableFormat = TableFormat {
         ("stage", MANY, Optional),
         ("sparc", Cell::Measure, Always),
         ("ldlj", Cell::Measure, Always),
+        ("action_change", Cell::Measure, Optional),
         ("starts", Cell::Starts, Optional),
     ],
     order: &["episode"],
     // Episode i of every method begins at the same start: a row that is missing would pair the wrong ones.
     counts: true,
 };
+
+pub(super) const RUNS: TableFormat = TableFormat {
+    columns: &[("version", Cell::Text, Always), ("configuration", Cell::Text, Always)],
+    order: &["seed"],
+    counts: false,
+};
+
+pub(super) const LEFT_OUT: TableFormat =
+    TableFormat { columns: &[("run", Cell::Text, Always), ("reason", Cell::Text, Always)], order: &[], counts: false };
 
 /// The table of a run.
 ///
@@ -178,7 +191,9 @@ fn read(path: &Path, format: &TableFormat, labels: &[(&'static str, Cell, Need)]
         let run: Vec<String> = labels.iter().map(|(name, ..)| text(name).to_string()).collect();
         let here: Vec<u64> = format.order.iter().map(|name| text(name).parse().unwrap_or_default()).collect();
         let before = last.insert(run, here.clone()).unwrap_or_default();
-        if here <= before || (format.counts && here[0] != before.first().unwrap_or(&0) + 1) {
+        if (here <= before && !format.order.is_empty())
+            || (format.counts && here[0] != before.first().unwrap_or(&0) + 1)
+        {
             let place = |numbers: &[u64]| {
                 let each = format.order.iter().zip(numbers).map(|(name, number)| format!("{name} {number}"));
                 each.collect::<Vec<_>>().join(", ")
@@ -218,7 +233,7 @@ enum Cells {
 impl Cells {
     fn new(cell: Cell) -> Self {
         match cell {
-            Cell::Name | Cell::Starts => Self::Text(cell, Vec::new()),
+            Cell::Name | Cell::Starts | Cell::Text => Self::Text(cell, Vec::new()),
             Cell::Count(limit) => Self::Whole(limit, Vec::new()),
             Cell::Flag => Self::Flags(Vec::new()),
             Cell::Share | Cell::Number | Cell::Measure | Cell::Within(..) => Self::Numbers(cell, Vec::new()),
@@ -232,6 +247,7 @@ impl Cells {
                 let starts: Starts = text.parse().map_err(|_| "it must be `test` or `development`")?;
                 names.push(starts.name().into());
             }
+            Self::Text(Cell::Text, texts) => texts.push(text.into()),
             Self::Text(_, names) => {
                 check_name("a task or method", text).map_err(|_| NAME_RULE)?;
                 names.push(text.into());
