@@ -124,6 +124,11 @@ impl GuidedMppi {
         &self.deviation[..self.action_size]
     }
 
+    /// The mean of the last plan's elites, `[horizon, actions]`.
+    pub fn mean(&self) -> &[f64] {
+        &self.mean
+    }
+
     /// Mean and deviation of the weighted elites.
     fn fit(&mut self, elites: &[&[f32]], weights: &[f64]) {
         let weighted = |of: &dyn Fn(f64) -> f64, i: usize| -> f64 {

@@ -31,6 +31,9 @@ pub struct TdMpc2Config {
     /// Exponent of the spectrum of the noise around a plan while it explores; white if absent.
     #[doc(alias = "pink noise")]
     pub exploration_noise_beta: Option<f64>,
+    /// In evaluations, execute the mean of a plan's last elites instead of one that is drawn from them: more precise, while
+    /// exploration keeps the variety of the elites.
+    pub evaluate_mean: bool,
     /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
     /// Discount factor gamma, per decision. Without one it follows from the length of an episode:
@@ -69,6 +72,7 @@ impl Default for TdMpc2Config {
             warm_up: 1000,
             warm_up_noise_beta: 0.0,
             exploration_noise_beta: None,
+            evaluate_mean: false,
             replay: 1_000_000,
             discount: None,
             n_step: 1,
@@ -99,6 +103,7 @@ ranges!(TdMpc2Config {
     warm_up: 0..=1_000_000_000,
     warm_up_noise_beta: 0.0..=10.0,
     exploration_noise_beta: 0.0..=10.0,
+    evaluate_mean: Any,
     replay: 2..=100_000_000,
     discount: 0.0..=1.0,
     n_step: 1..=1000,

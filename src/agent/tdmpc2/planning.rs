@@ -57,6 +57,8 @@ pub(super) struct Controller {
     action_repeat: usize,
     /// What it explores with, unless that is white noise.
     noise: Option<RandomActions>,
+    /// Whether it executes the mean of a plan where it does not explore.
+    evaluate_mean: bool,
     pub rng: Rng,
 }
 
@@ -68,6 +70,7 @@ impl Controller {
             held: Held::default(),
             action_repeat: config.action_repeat,
             noise: config.exploration_noise_beta.map(|beta| RandomActions::new(beta, decisions, spec.action_size)),
+            evaluate_mean: config.evaluate_mean,
             rng,
         }
     }
@@ -75,6 +78,11 @@ impl Controller {
     /// The planner of a slot, which depends on nothing but the slot's index.
     pub fn of_slot(config: &TdMpc2Config, spec: &Spec, index: usize) -> Self {
         Self::new(config, spec, rng::stream(index as u64, "tdmpc2 seat"))
+    }
+
+    #[cfg(test)]
+    pub fn planner(&self) -> &GuidedMppi {
+        &self.planner
     }
 
     /// A new episode begins.
@@ -87,9 +95,10 @@ impl Controller {
     /// The next action from `obs`; plans when the last one has been held long enough. To `explore`, noise of the plan's own
     /// deviation is added.
     pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
-        let Self { planner, held, action_repeat, noise, rng } = self;
+        let Self { planner, held, action_repeat, noise, evaluate_mean, rng } = self;
+        let mean = *evaluate_mean && !explore;
         held.next(*action_repeat, || {
-            let planned = plan(planner, rng, world, obs, observer);
+            let planned = plan(planner, rng, world, obs, mean, observer);
             let deviates: Vec<f64> = match noise {
                 _ if !explore => vec![0.0; planned.len()],
                 Some(noise) => noise.deviates(rng).into_iter().map(f64::from).collect(),
@@ -102,12 +111,13 @@ impl Controller {
     }
 }
 
-/// The first action of a plan; the rest of it stays for the next search.
+/// The first action of a plan, or of its `mean`; the rest of it stays for the next search.
 fn plan(
     planner: &mut GuidedMppi,
     rng: &mut Rng,
     world: Imagined,
     obs: &[f32],
+    mean: bool,
     observer: &mut PlanObserver,
 ) -> Vec<f32> {
     let Imagined { model, frozen, discount } = world;
@@ -115,6 +125,9 @@ fn plan(
     let critics = model.config().critics;
     let mut objective = LatentReturns { model: frozen, z: values(&z), critics, discount, rng: rng::fork(rng) };
     let mut actions = planner.plan(&mut objective, observer, rng).actions;
+    if mean {
+        actions = planner.mean().iter().map(|a| *a as f32).collect();
+    }
     actions.truncate(planner.deviation().len());
     planner.shift(1);
     actions
