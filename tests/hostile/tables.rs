@@ -370,9 +370,9 @@ fn a_model_that_diverged_is_reported() {
             set_cell(&mut study, table, 2, column, number);
         }
         let text = study.report().expect("a report");
-        for note in ["not finite: 1 of the numbers about `pets`", "not finite: 2 of the numbers about `dreamer`"] {
-            assert_eq!(text.contains(note), !number.is_empty(), "`{number}`, `{note}`: {text}");
-        }
+        // One of its model, two of the returns that it expected and got.
+        let note = "not finite: 3 of the numbers about `pets`";
+        assert_eq!(text.contains(note), !number.is_empty(), "`{number}`: {text}");
         assert!(!text.contains("NaN") && !text.contains("inf "), "{text}");
     }
 }
