@@ -116,6 +116,17 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("pets", column));
     quotes.push(("README.md", format!("SAC takes at least {ratio:.1} times as many (95 % interval from {low:.1})")));
     quotes.push(("chapters/00-start.md", format!("needs at least {ratio:.1} times as many")));
+    let lift = |method: &str, column: &str| in_study("lift-pets-sac", "lift", method, column);
+    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| lift("pets", column));
+    quotes.push((
+        "README.md",
+        format!("SAC takes at least {ratio:.1} times as many steps (interval from {low:.1}), and one of its seeds"),
+    ));
+    quotes.push((
+        "README.md",
+        format!("PETS lifts in {} of the test episodes", success("lift-pets-sac", "lift", "pets")),
+    ));
+    assert_eq!([lift("pets", "steps_to_80"), lift("pets", "seeds_reaching_80")], [10_000.0, 5.0]);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("tdmpc2", column));
     quotes.push(("README.md", format!("(SAC takes at least {ratio:.1} times as many, interval from {low:.1})")));
     let tdmpc2 = format!("SAC takes at least {ratio:.1} times as many steps (95 % interval from {low:.1};");
