@@ -29,7 +29,7 @@ use crate::replay::Episode;
 const ENVS: usize = 20;
 
 /// What came of one episode.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeResult {
     /// Sum of rewards.
     #[serde(rename = "return")]
@@ -180,16 +180,7 @@ impl<E: Env> Evaluator<E> {
         let mut observations = self.envs.reset(seeds)?;
         let count = seeds.len();
         let mut paths: Vec<Vec<[f64; 3]>> = (0..count).map(|i| self.envs.env(i).hand().into_iter().collect()).collect();
-        let blank = EpisodeResult {
-            total: 0.0,
-            success: false,
-            length: 0,
-            stage: 0,
-            sparc: None,
-            ldlj: None,
-            action_change: None,
-        };
-        let mut results = vec![blank; count];
+        let mut results = vec![EpisodeResult::default(); count];
         let recorded = observations.iter().map(|obs| Episode { observations: vec![obs.clone()], ..Episode::default() });
         let mut recorded: Vec<Episode> = recorded.collect();
         evaluation.action_ms = time_of_action(policy, Slot::single(true, &observations[0], self.envs.env(0)))?;

@@ -62,10 +62,16 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
          earlier the probability that a seed has more success in the test than one of `{BASELINE}`, or reaches {:.0} % by an earlier step.\n",
         100.0 * LEVEL
     );
+    let mut not_alike = Vec::new();
     for task in &tasks {
         let (curves, tests) = (format!("{task}-learning.svg"), format!("{task}-test.svg"));
         write!(text, "\n## {task}\n\n").expect("text grows");
         text += &findings(&tables, task)?;
+        let unlike = different_grids(&tables, task)?;
+        if !unlike.is_empty() {
+            not_alike.push(*task);
+        }
+        text += &unlike;
         text += &details(&tables, task)?;
         if figures::learning_curves(&tables, task, &to.join(&curves))? {
             write!(text, "\n![Success rate of each method on {task} over environment steps]({curves})\n")
@@ -104,12 +110,6 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     }
     text += "\n## How certain is this?\n\n";
     text += &caveat(&tables, &pairs)?;
-    let mut not_alike = Vec::new();
-    for task in &tasks {
-        if !different_grids(&tables, task)?.is_empty() {
-            not_alike.push(*task);
-        }
-    }
     text += "\n## Checklist\n\n";
     text += &provenance::checklist(&tables, &not_alike)?;
     let configurations = provenance::configurations(&tables)?;
@@ -219,7 +219,7 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
         text += &against_the_baseline(tables, task, &method)?;
         text.push('\n');
     }
-    Ok(text + &different_grids(tables, task)?)
+    Ok(text)
 }
 
 /// The numbers of the methods that learn a task which the first table has no room for.

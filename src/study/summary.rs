@@ -6,7 +6,7 @@ use super::statistics::{
     IQM_RUNS, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
     probability_of_improvement, ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
 };
-use super::tables::{BASELINE, Curve, LEVEL, by_run, curves, lists, of, strings};
+use super::tables::{BASELINE, Curve, LEVEL, by_run, curves, lists, of, optional_curves, strings};
 use crate::rng::{self, Rng};
 
 /// The runs of one method on one task.
@@ -54,10 +54,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
         let success = lists(&rows, "success")?;
-        let over_steps = |column: &str| match evaluations.column(column) {
-            Ok(_) => curves(evaluations, &task, &method, column),
-            Err(_) => Ok(Vec::new()),
-        };
+        let over_steps = |column: &str| optional_curves(evaluations, &task, &method, column);
         let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
         let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
         let of_values = |column: &str| self::curves(values, &task, &method, column);
@@ -216,7 +213,7 @@ impl Runs {
             ("success_minus_sac_low", Some(low)),
             ("success_minus_sac_high", Some(high)),
         ];
-        // Who never gets there gets there last.
+        // A censored run is later than any other.
         let sooner = |runs: &Self| runs.times().iter().map(|time| -time.unwrap_or(f64::INFINITY)).collect::<Vec<f64>>();
         for (entries, first, second) in [
             (

@@ -1,4 +1,4 @@
-//! How good the model of PETS is, and what becomes of its plans.
+//! How good the model of PETS is, and how far the predictions of its plans come true.
 
 use rayon::prelude::*;
 
@@ -84,8 +84,8 @@ mod tests {
     use crate::plan::{IcemConfig, PlannerConfig};
     use crate::replay::Transition;
 
-    /// A plan's prediction is held against the rewards of as many recorded time steps as it has, and plans that reach beyond the
-    /// episode are not held against anything.
+    /// A plan's prediction is compared with the rewards of as many recorded time steps as it has. Plans that reach beyond the
+    /// episode are left out.
     #[test]
     fn predictions_are_compared_with_what_followed() {
         const HORIZON: usize = 6;

@@ -42,7 +42,7 @@ pub fn profile(tables: &Tables, task: &str, path: &Path) -> Result<bool> {
         let shares = thresholds.iter().copied().zip(performance_profile(&seeds, &thresholds));
         profile = profile.line(&method, shares).coloured(colour);
         for ((_, success), (_, seconds)) in curves.iter().zip(tables.clocks(task, &method)?) {
-            // Before the first second, nothing is learned.
+            // A logarithmic axis has no zero.
             let over_seconds: Vec<(f64, f64)> =
                 seconds.into_iter().map(|s| s.max(1.0)).zip(success.iter().copied()).collect();
             timed = true;

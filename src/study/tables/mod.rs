@@ -120,7 +120,7 @@ impl Tables {
         if self.left_out.width() > 0 {
             return write(&left_out, &self.left_out);
         }
-        // That of an earlier attempt.
+        // What an earlier attempt left behind.
         match std::fs::remove_file(&left_out) {
             Err(problem) if problem.kind() != ErrorKind::NotFound => Err(Error::io("remove", &left_out)(problem)),
             _ => Ok(()),
@@ -154,10 +154,7 @@ impl Tables {
     /// # Errors
     /// If the table lacks a column.
     pub fn clocks(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
-        match self.evaluations.column("seconds") {
-            Ok(_) => curves(&self.evaluations, task, method, "seconds").map_err(inside),
-            Err(_) => Ok(Vec::new()),
-        }
+        optional_curves(&self.evaluations, task, method, "seconds").map_err(inside)
     }
 
     /// The final test of a method: for each seed, 1 for each episode that succeeds, 0 for each other.
@@ -165,7 +162,7 @@ impl Tables {
     /// # Errors
     /// If the table lacks a column.
     pub fn successes(&self, task: &str, method: &str) -> Result<Vec<Vec<f64>>> {
-        let found = || lists(&of(&by_run(self.tests.clone().lazy(), &["success"])?, task, method)?, "success");
+        let found = || lists(&by_run(of(&self.tests, task, method)?.lazy(), &["success"])?, "success");
         found().map_err(inside)
     }
 
@@ -257,6 +254,11 @@ pub(super) fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) ->
     let known = of(rows, task, method)?.lazy().filter(shown);
     let runs = by_run(known, &["step", value])?;
     Ok(lists(&runs, "step")?.into_iter().zip(lists(&runs, value)?).collect())
+}
+
+/// The same for a column that tables of earlier versions do not have: none of it then.
+pub(super) fn optional_curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
+    if rows.column(value).is_ok() { curves(rows, task, method, value) } else { Ok(Vec::new()) }
 }
 
 pub(super) fn lists(runs: &DataFrame, column: &str) -> PolarsResult<Vec<Vec<f64>>> {
