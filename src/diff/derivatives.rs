@@ -32,8 +32,8 @@ pub struct Linear<const N: usize, const M: usize> {
     pub by_action: SMatrix<f64, N, M>,
 }
 
-/// So many derivatives go with each number through a step at once. With more, as the arm has them, most of the time would go into
-/// copying them about, and a step for each column is four times as fast (`benches/diff.rs`).
+/// The most derivatives that each number carries through a step. With more, as the arm has them, copying them would dominate, and one
+/// step for each column is four times as fast (`benches/diff.rs`).
 const FEW: usize = 12;
 
 /// The exact Jacobians of a step, by forward mode.

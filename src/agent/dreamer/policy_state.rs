@@ -59,7 +59,7 @@ impl PolicyState {
     }
 
     /// The next action: a new decision when the last one has been held for long enough. It is the planner's if there is one, else
-    /// the policy's mean, or so many standard deviations from the mean as the `noise` tells.
+    /// the policy's mean plus `noise` times its standard deviation; without noise, the mean.
     pub fn act(&mut self, networks: &Networks, obs: &[f32], noise: impl FnOnce() -> Option<Vec<f32>>) -> Vec<f32> {
         let mut held = std::mem::take(&mut self.held);
         let action = held.next(self.action_repeat, || self.decide(networks, obs, noise().as_deref()));
