@@ -127,6 +127,16 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         format!("PETS lifts in {} of the test episodes", success("lift-pets-sac", "lift", "pets")),
     ));
     assert_eq!([lift("pets", "steps_to_80"), lift("pets", "seeds_reaching_80")], [10_000.0, 5.0]);
+    let lift = |column: &str| in_study("lift-tdmpc2-sac", "lift", "tdmpc2", column);
+    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(lift);
+    let tested = success("lift-tdmpc2-sac", "lift", "tdmpc2");
+    quotes.push((
+        "README.md",
+        format!(
+            "{ratio:.1} times as many (interval from {low:.1}), and TD-MPC2 lifts in {tested} of the test episodes"
+        ),
+    ));
+    assert_eq!([lift("steps_to_80"), lift("seeds_reaching_80")], [8000.0, 5.0]);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("tdmpc2", column));
     quotes.push(("README.md", format!("(SAC takes at least {ratio:.1} times as many, interval from {low:.1})")));
     let tdmpc2 = format!("SAC takes at least {ratio:.1} times as many steps (95 % interval from {low:.1};");
