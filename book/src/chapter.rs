@@ -51,7 +51,7 @@ impl Chapter {
     /// Splits a chapter into its parts.
     ///
     /// # Errors
-    /// If a fence is not closed.
+    /// If a fence is not closed, or opens without a language.
     pub fn parse(name: &str, text: &str) -> io::Result<Self> {
         let mut parts = Vec::new();
         let mut prose = String::new();
@@ -64,12 +64,16 @@ impl Chapter {
                 prose.push('\n');
                 continue;
             }
+            let refused = |why: &str| {
+                Err(Error::new(ErrorKind::InvalidData, format!("chapters/{name}.md:{}: this fence {why}", at + 1)))
+            };
+            // Where the opening fence of a cell is lost, its closing fence would hide the text up to the next cell.
+            if line == "```" {
+                return refused("names no language; is an opening fence missing above it?");
+            }
             let mut fence = String::new();
             loop {
-                let Some((_, inside)) = lines.next() else {
-                    let message = format!("chapters/{name}.md:{}: this fence is not closed", at + 1);
-                    return Err(Error::new(ErrorKind::InvalidData, message));
-                };
+                let Some((_, inside)) = lines.next() else { return refused("is not closed") };
                 if inside == "```" {
                     break;
                 }

@@ -51,10 +51,10 @@ pub fn unformatted(chapter: &Chapter) -> io::Result<Vec<usize>> {
 /// The text of a chapter with all cells formatted.
 ///
 /// # Errors
-/// As [`formatted`].
-pub fn rewritten(chapter: &Chapter, text: &str) -> io::Result<String> {
+/// As [`formatted`], and if a fence is not closed or names no language.
+pub fn rewritten(name: &str, text: &str) -> io::Result<String> {
     let mut lines: Vec<String> = text.lines().map(String::from).collect();
-    for part in chapter.parts.iter().rev() {
+    for part in Chapter::parse(name, text)?.parts.iter().rev() {
         if let Part::Cell { code, line, .. } = part {
             let from = line - 1;
             lines.splice(from..from + code.lines().count(), formatted(code)?.lines().map(String::from));

@@ -169,7 +169,7 @@ fn format(root: &Path) -> Result<()> {
     for chapter in Chapter::all(&root.join("chapters"))? {
         let path = root.join(format!("chapters/{}.md", chapter.name));
         let text = fs::read_to_string(&path)?;
-        let formatted = format::rewritten(&chapter, &text).with_context(|| path.display().to_string())?;
+        let formatted = format::rewritten(&chapter.name, &text).with_context(|| path.display().to_string())?;
         if formatted != text {
             fs::write(&path, formatted)?;
             println!("formatted chapters/{}.md", chapter.name);

@@ -184,6 +184,8 @@ fn a_chapter_is_taken_apart_and_its_program_keeps_the_lines() {
     assert!(!program.contains("not run"));
     let error = Chapter::parse("t", "```rust\nlet x = 1;\n").expect_err("a fence that is not closed");
     assert!(error.to_string().contains("chapters/t.md:1"), "{error}");
+    let error = Chapter::parse("t", "let x = 1;\n```\n").expect_err("a cell without its opening fence");
+    assert!(error.to_string().contains("chapters/t.md:2"), "{error}");
 }
 
 /// A planted change, a planted gap and a planted panic are each found.
