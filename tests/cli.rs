@@ -109,6 +109,18 @@ fn a_small_study_from_start_to_report() {
     ] {
         assert!(here.join("study/reach/debug/seed1").join(file).exists(), "{file}");
     }
+    // Two episodes of each method can be replayed in the report, with the returns that they had in the test.
+    let read = |file: &str| std::fs::read_to_string(here.join("study").join(file)).expect(file);
+    let (tests, replays, page) = (read("tests.csv"), read("replays.csv"), read("report.html"));
+    assert_eq!(page.matches("class=\"replay\" value=\"replays/reach-").count(), 6);
+    for row in replays.lines().skip(1) {
+        let [task, method, seed, _, episode, total, success, file] = row.split(',').collect::<Vec<_>>()[..] else {
+            panic!("{row}")
+        };
+        let tested = format!("\n{task},{method},{seed},{episode},{total},{success},");
+        assert!(tests.contains(&tested), "{tested} is not in\n{tests}");
+        assert!(page.contains(&format!("id=\"{}\"", file.trim_end_matches(".json.gz"))), "{file}");
+    }
     let head = std::fs::read_to_string(here.join("study/reach/debug/seed0/evaluations.csv")).expect("evaluations");
     assert_eq!(
         head.lines().next(),
@@ -145,7 +157,7 @@ fn a_small_study_from_start_to_report() {
     std::fs::remove_dir_all(here.join("study/reach")).expect("runs to remove");
     let report = handful(here, &["report", "--from", "study", "--out", "elsewhere"]);
     assert!(report.status.success(), "{}", text(&report.stderr));
-    for file in ["summary.csv", "report.md"] {
+    for file in ["summary.csv", "report.md", "report.html"] {
         let [first, second] =
             ["study", "elsewhere"].map(|folder| std::fs::read_to_string(here.join(folder).join(file)).expect(file));
         assert_eq!(first, second);

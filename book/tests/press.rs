@@ -90,7 +90,8 @@ fn test_successes(study: &str, task: &str, method: &str) -> Vec<usize> {
     let path = root().join("data/study").join(study).join("tests.csv");
     let table = std::fs::read_to_string(path).expect("a table of tests");
     let mut seeds = std::collections::BTreeMap::new();
-    for row in table.lines().map(|line| line.split(',').collect::<Vec<&str>>()).filter(|row| row[..2] == [task, method]) {
+    for row in table.lines().map(|line| line.split(',').collect::<Vec<&str>>()).filter(|row| row[..2] == [task, method])
+    {
         *seeds.entry(row[2].to_string()).or_default() += usize::from(row[5] == "true");
     }
     seeds.into_values().collect()

@@ -1,6 +1,6 @@
 //! Policies that do not learn: the lower bound, and what a person would write.
 
-use super::{Agent, Checkpoint, Mode};
+use super::{Agent, Checkpoint, Mode, Slot, Slots};
 use crate::checkpoint::Weights;
 use crate::env::tabletop::{ObservationKind, TableOptions};
 use crate::env::{Spec, Task};
@@ -11,14 +11,20 @@ use crate::rng::{self, Rng};
 #[derive(Debug)]
 pub struct Random {
     action_size: usize,
+    seed: u64,
     rng: Rng,
+    slots: Slots<Rng>,
 }
 
 impl Random {
     /// Random actions for an environment.
     pub fn new(spec: &Spec, seed: u64) -> Self {
-        Self { action_size: spec.action_size, rng: rng::stream(seed, "random agent") }
+        Self { action_size: spec.action_size, seed, rng: rng::stream(seed, "random agent"), slots: Slots::default() }
     }
+}
+
+fn random_action(size: usize, rng: &mut Rng) -> Vec<f32> {
+    (0..size).map(|_| rng::uniform(rng, -1.0, 1.0) as f32).collect()
 }
 
 /// A function from observations to actions.
@@ -56,7 +62,13 @@ impl std::fmt::Debug for Scripted {
 
 impl Agent for Random {
     fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
-        (0..self.action_size).map(|_| rng::uniform(&mut self.rng, -1.0, 1.0) as f32).collect()
+        random_action(self.action_size, &mut self.rng)
+    }
+
+    fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
+        let Self { action_size, seed, slots: states, .. } = self;
+        let fresh = |index| rng::stream(*seed, &format!("random agent, slot {index}"));
+        states.states(slots, fresh).into_iter().map(|rng| random_action(*action_size, rng)).collect()
     }
 }
 

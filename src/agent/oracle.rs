@@ -1,8 +1,8 @@
 //! The oracle: a planner on the true simulator.
 //!
 //! It is no agent that anyone could have: it tries action sequences out in a copy of the very environment in which it
-//! acts. It is the upper bound for everything that plans in a learned model: what remains between such an agent and the
-//! oracle is the model's error, not the planner's.
+//! acts. Between an agent that plans in a learned model with the same planner and objective, and the oracle, lies the
+//! model's error alone. It is no upper bound on what agents can achieve: another planner or a longer horizon may do better.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};

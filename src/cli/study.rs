@@ -89,7 +89,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     let progress = Progress::new(&runs);
     runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
     progress.finish();
-    conclude(&runs, &plan.folder)
+    conclude(registry, &runs, &plan.folder)
 }
 
 /// A line for each task and method, and one for all.
@@ -135,14 +135,17 @@ fn seed_range(text: &str) -> Result<Range<u64>, String> {
 }
 
 #[cfg(feature = "study")]
-fn conclude(runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
     let tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
     tables.write(folder)?;
+    for problem in crate::study::replays::record(registry, runs, folder)? {
+        super::output::note(format_args!("no replay: {problem}"));
+    }
     super::report::write(folder, folder)
 }
 
 #[cfg(not(feature = "study"))]
-fn conclude(_runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+fn conclude(_registry: &Registry, _runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
     let advice = "build with the feature `study` for tables and figures";
     super::output::answer(format_args!("the runs are in {}; {advice}", folder.display()))
 }

@@ -26,7 +26,7 @@ use crate::error::{Error, Result};
 use crate::replay::Episode;
 
 /// Environments that are stepped side by side; agents act in all of them in one forward pass.
-const ENVS: usize = 20;
+pub(super) const ENVS: usize = 20;
 
 /// What came of one episode.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

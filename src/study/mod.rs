@@ -50,6 +50,8 @@ mod provenance;
 pub mod records;
 pub mod registry;
 #[cfg(feature = "study")]
+pub mod replays;
+#[cfg(feature = "study")]
 pub mod report;
 pub mod run;
 pub mod runner;

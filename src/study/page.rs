@@ -1,19 +1,29 @@
-//! A report as one HTML file that needs nothing else: its Markdown as a page, with the figures inside.
+//! A report as one HTML file that needs nothing else: its Markdown as a page, with the figures and the replays inside.
 
+use std::io::Write;
 use std::path::Path;
 
+use base64::prelude::{BASE64_STANDARD, Engine};
+use flate2::Compression;
+use flate2::write::GzEncoder;
 use pulldown_cmark::{CowStr, Event, Options, Parser, Tag, TagEnd, html};
 
 use crate::error::{Error, Result};
+use crate::watch;
 
 const STYLE: &str = include_str!("page.css");
+const REPLAYS: &str = include_str!("replays.js");
 
-/// The page of a report. Its figures are read from `folder`.
+/// A link to a file of this kind becomes a button that plays it.
+const RECORDING: &str = ".json.gz";
+
+/// The page of a report. Its figures and recordings are read from `folder`.
 ///
 /// # Errors
-/// If a figure cannot be read.
+/// If one of them cannot be read.
 pub(super) fn page(markdown: &str, folder: &Path) -> Result<String> {
     let mut events = Vec::new();
+    let mut recordings = String::new();
     let mut parser = Parser::new_ext(markdown, Options::ENABLE_TABLES);
     while let Some(event) = parser.next() {
         match event {
@@ -21,6 +31,19 @@ pub(super) fn page(markdown: &str, folder: &Path) -> Result<String> {
                 let inside = parser.by_ref().take_while(|event| *event != Event::End(TagEnd::Image));
                 let caption: Vec<CowStr> = inside.filter_map(text).collect();
                 events.push(Event::InlineHtml(figure(&folder.join(&*dest_url), &caption.concat())?.into()));
+            }
+            Event::Start(Tag::Link { dest_url, title, .. }) if dest_url.ends_with(RECORDING) => {
+                let inside = parser.by_ref().take_while(|event| *event != Event::End(TagEnd::Link));
+                let label: Vec<CowStr> = inside.filter_map(text).collect();
+                let path = folder.join(&*dest_url);
+                let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
+                let id = dest_url.trim_end_matches(RECORDING);
+                recordings += &embedded(id, &bytes);
+                let [id, title, label] = [id, &title, &label.concat()].map(escaped);
+                let button = format!(
+                    "<button type=\"button\" class=\"replay\" value=\"{id}\" title=\"{title}\">{label}</button>"
+                );
+                events.push(Event::InlineHtml(button.into()));
             }
             // On a narrow screen a table scrolls, not the page.
             Event::Start(Tag::Table(_)) => events.extend([Event::Html("<div class=\"table\">".into()), event]),
@@ -30,10 +53,27 @@ pub(super) fn page(markdown: &str, folder: &Path) -> Result<String> {
     }
     let mut body = String::new();
     html::push_html(&mut body, events.into_iter());
+    if !recordings.is_empty() {
+        let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
+        gzip.write_all(watch::empty_page().as_bytes()).expect("memory takes everything");
+        let empty_page = gzip.finish().expect("memory takes everything");
+        recordings += &embedded("replay-page", &empty_page);
+        recordings += &format!("<script type=\"module\">\n{REPLAYS}</script>\n");
+    }
     Ok(format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>Comparison</title>\n<meta name=\"viewport\" \
-         content=\"width=device-width, initial-scale=1\">\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n</body>\n</html>\n"
+         content=\"width=device-width, initial-scale=1\">\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n{recordings}</body>\n</html>\n"
     ))
+}
+
+/// Compressed bytes in the page itself, for its script to find by `id`.
+fn embedded(id: &str, gzip: &[u8]) -> String {
+    let (id, bytes) = (escaped(id), BASE64_STANDARD.encode(gzip));
+    format!("<script type=\"application/gzip;base64\" id=\"{id}\">{bytes}</script>\n")
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
 }
 
 fn text(event: Event) -> Option<CowStr> {
@@ -46,7 +86,7 @@ fn text(event: Event) -> Option<CowStr> {
 /// A figure in the page itself, with what it shows for those who do not see it.
 fn figure(path: &Path, caption: &str) -> Result<String> {
     let svg = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
-    let label = caption.replace('&', "&amp;").replace('"', "&quot;");
+    let label = escaped(caption);
     Ok(format!("<span class=\"figure\" role=\"img\" aria-label=\"{label}\">{svg}</span>"))
 }
 
@@ -64,6 +104,10 @@ mod tests {
         assert!(page.contains("<h1>A</h1>") && page.contains("<td><code>c</code></td>"));
         assert!(page.contains(&format!("aria-label=\"The &quot;d&quot; of e\">{svg}</span>")), "{page}");
         assert!(!page.contains("src=") && !page.contains("href="));
+        std::fs::write(folder.path().join("b.json.gz"), "gzip").expect("a writable folder");
+        let page = super::page("[\"c\"](b.json.gz \"d\")", folder.path()).expect("a page");
+        assert!(page.contains("value=\"b\" title=\"d\">&quot;c&quot;</button>"), "{page}");
+        assert!(page.contains("id=\"b\">Z3ppcA==</script>") && page.contains("id=\"replay-page\">H4sI"));
         let problem = super::page("![f](g.svg)", folder.path()).expect_err("there is no such figure");
         assert!(problem.to_string().contains("g.svg"), "{problem}");
     }

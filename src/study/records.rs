@@ -185,7 +185,7 @@ pub(super) fn write_test(folder: &Path, test: &Evaluation) -> Result<()> {
     write_csv(&folder.join("test.csv"), &TEST_COLUMNS, rows)
 }
 
-fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
+pub(super) fn write_csv<T: Serialize>(path: &Path, columns: &[&str], rows: impl Iterator<Item = T>) -> Result<()> {
     let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
     let composed =
         writer.write_record(columns).and_then(|()| rows.into_iter().try_for_each(|row| writer.serialize(row)));

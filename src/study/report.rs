@@ -7,6 +7,7 @@ use std::time::Duration;
 use super::figures;
 use super::page;
 use super::provenance;
+use super::replays;
 use super::starts::Starts;
 use super::tables::{BASELINE, Curve, LEVEL, Tables};
 use super::verdict::verdict;
@@ -39,6 +40,8 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     text += "and every environment step counted, including the random warm-up. ";
     text += "They are not given the same information: `oracle` plans in the true simulator; `pets` plans in a learned model, but ";
     text += "is given the reward function; `pets-learned`, `dreamer`, `tdmpc2` and `sac` have only the rewards that they receive.\n\n";
+    let replays = replays::read(from)?;
+    replays::copy(&replays, from, to)?;
     let verdict = verdict(&tables, &tasks)?;
     if !verdict.is_empty() {
         text += &format!("## Verdict\n\n{verdict}\n");
@@ -85,6 +88,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
         figures::tests(&tables, task, &to.join(&tests))?;
         write!(text, "\n![Success rate and smoothness of each method on {task} in the final test]({tests})\n")
             .expect("text grows");
+        text += &replays::table(&replays, task);
         for (_, method) in pairs.iter().filter(|(of, _)| of == task) {
             let stem = figures::stem(task, method);
             let file = format!("{stem}-model.svg");

@@ -47,7 +47,7 @@ pub struct Recording {
 struct Path3 {
     points: Vec<[f64; 3]>,
     value: f64,
-    spread: f64,
+    spread: f32,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -81,6 +81,21 @@ impl Recording {
     /// # Errors
     /// If the environment cannot take the policy's actions, or breaks its contract.
     pub fn of_episode<E: Env, P: Policy + ?Sized>(title: String, env: E, policy: &mut P, seed: u64) -> Result<Self> {
+        Self::of_slot(title, env, policy, seed, 0)
+    }
+
+    /// The same, as the environment of that index among those that an evaluation runs side by side: a policy's random numbers may depend
+    /// on it.
+    ///
+    /// # Errors
+    /// As for [`Recording::of_episode`].
+    pub(crate) fn of_slot<E: Env, P: Policy + ?Sized>(
+        title: String,
+        env: E,
+        policy: &mut P,
+        seed: u64,
+        index: usize,
+    ) -> Result<Self> {
         env.spec().check()?;
         let mut env = Checked::new(env);
         let mut obs = env.reset(seed)?;
@@ -89,7 +104,7 @@ impl Recording {
         let mut frames = vec![Frame { poses: poses(env.env()), reward: 0.0, success: false, action: rest }];
         let mut paths = Vec::new();
         loop {
-            let slot = Slot::single(frames.len() == 1, &obs, env.env());
+            let slot = Slot { index, ..Slot::single(frames.len() == 1, &obs, env.env()) };
             let (action, trajectories) = policy.explained_action(&slot)?;
             paths.push(drawn_trajectories(env.env(), &trajectories));
             let step = env.step(&action)?;
@@ -113,30 +128,23 @@ impl Recording {
         self.frames.last().is_some_and(|frame| frame.success)
     }
 
+    /// Sum of rewards.
+    pub fn total(&self) -> f64 {
+        self.frames.iter().map(|frame| f64::from(frame.reward)).sum()
+    }
+
+    /// What [`Recording::to_html`] puts into the page: JSON in which `<` is written as an escape, so that no name can close the script
+    /// around it.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("a recording is JSON").replace('<', "\\u003c")
+    }
+
     /// The page.
     pub fn to_html(&self) -> String {
-        // In JSON, `<` may be written so, and no name can then close the script around it.
-        let json = serde_json::to_string(self).expect("a recording is JSON").replace('<', "\\u003c");
         let escape =
             |text: &str| text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;");
-        let title = escape(&self.title);
-        // One pass: what has been filled in is not searched again.
-        let mut page = String::new();
-        let mut rest = PAGE;
-        while let Some((before, after)) = rest.split_once("{{") {
-            let (name, after) = after.split_once("}}").expect("placeholders are closed");
-            page.push_str(before);
-            page.push_str(match name {
-                "title" => &title,
-                "recording" => &json,
-                "three" => THREE,
-                "viewer" => VIEWER,
-                other => panic!("the page has no part called {other}"),
-            });
-            rest = after;
-        }
-        page.push_str(rest);
-        page
+        let (title, json) = (escape(&self.title), self.to_json());
+        filled(&[("title", &title), ("recording", &json), ("three", THREE), ("viewer", VIEWER)])
     }
 
     /// Shows it in a notebook, in a frame of its own; called by the kernel.
@@ -157,14 +165,37 @@ impl Recording {
     }
 }
 
+/// The page without an episode, for a page with several: `{{title}}` and `{{recording}}` stand where an escaped title and the JSON of a
+/// recording belong.
+#[cfg(feature = "study")]
+pub(crate) fn empty_page() -> String {
+    filled(&[("three", THREE), ("viewer", VIEWER)])
+}
+
+/// The page with some of its parts filled in; what has been filled in is not searched again.
+fn filled(parts: &[(&str, &str)]) -> String {
+    let mut page = String::new();
+    let mut rest = PAGE;
+    while let Some((before, after)) = rest.split_once("{{") {
+        let (name, after) = after.split_once("}}").expect("placeholders are closed");
+        page.push_str(before);
+        match parts.iter().find(|(part, _)| *part == name) {
+            Some((_, content)) => page.push_str(content),
+            None => page.extend(["{{", name, "}}"]),
+        }
+        rest = after;
+    }
+    page + rest
+}
+
 /// Imagined trajectories as lines, their values scaled to lie between 0 and 1.
 fn drawn_trajectories(env: &impl Env, trajectories: &[ImaginedTrajectory]) -> Vec<Path3> {
     let values = || trajectories.iter().map(|trajectory| f64::from(trajectory.value)).filter(|value| value.is_finite());
     let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
     let drawn = trajectories.iter().filter(|trajectory| trajectory.value.is_finite()).map(|trajectory| Path3 {
         points: trajectory.observations.iter().filter_map(|obs| env.position_of(obs)).map(|p| p.map(round)).collect(),
-        value: (f64::from(trajectory.value) - low) / (high - low).max(1e-9),
-        spread: f64::from(trajectory.disagreement),
+        value: round((f64::from(trajectory.value) - low) / (high - low).max(1e-9)),
+        spread: trajectory.disagreement,
     });
     drawn.filter(|path| path.points.iter().flatten().all(|x| x.is_finite())).collect()
 }
