@@ -108,7 +108,7 @@ pub(super) fn table(replays: &[Replay], task: &str) -> String {
     let link = |replay: &Replay| {
         let outcome = if replay.success { "success" } else { "no success" };
         let Replay { method, seed, episode, total, file, .. } = replay;
-        format!("[return {total:.1}, {outcome}]({file} \"{method} on {task}, seed {seed}, test episode {episode}\")")
+        format!("[{total:.1}, {outcome}]({file} \"{method} on {task}, seed {seed}, test episode {episode}\")")
     };
     let rows = of_task.iter().filter(|replay| replay.which == Which::Median).map(|median| {
         let worst = of_task.iter().find(|other| other.which == Which::Worst && other.method == median.method);
@@ -120,9 +120,9 @@ pub(super) fn table(replays: &[Replay], task: &str) -> String {
         return rows;
     }
     format!(
-        "\nEpisodes of the test in 3D: of the median seed of each method, by success and then return, the episode with the median return \
-         and the one with the lowest. (They play in `report.html`. Lines that fan out from the hand are the futures that a planner compared.)\n\n\
-         | method | seed | median episode | worst episode |\n| --- | --- | --- | --- |\n{rows}"
+        "\nTwo test episodes of each method's median seed (by success, then return), which play in 3D in `report.html`: the one with the \
+         median return and the one with the lowest. Lines from the hand are plans that the method compares.\n\n\
+         | method | seed | median return | lowest return |\n| --- | --- | --- | --- |\n{rows}"
     )
 }
 
