@@ -178,7 +178,7 @@ impl<const M: usize> IlqrControl<M> {
 /// k = argmin of k' Quu k / 2 + Qu' k within the bounds,  K = -Quu^-1 Qux for free actions,
 /// Vx = Qx + K' Quu k + K' Qu + Qux' k,  Vxx = Qxx + K' Quu K + K' Qux + Qux' K.
 ///
-/// None if the regularised Quu is not positive definite.
+/// None if the regularised Quu is not positive definite among the actions that are not held at a bound.
 fn backward<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     about: &Solution<N, M>,
@@ -250,7 +250,7 @@ fn forward<const N: usize, const M: usize>(
 }
 
 /// The box-constrained quadratic program of box-DDP (Tassa et al. 2014): the x within bounds that minimises x' H x / 2 + g' x,
-/// and which of its numbers are free (not held at a bound), by projected Newton steps. None if H is not positive definite.
+/// and which of its numbers are free (not held at a bound), by projected Newton steps. None if H is not positive definite among the free ones.
 fn box_qp<const M: usize>(
     h: &SMatrix<f64, M, M>,
     g: &SVector<f64, M>,

@@ -173,7 +173,7 @@ impl Agent for Dreamer {
         let Networks { world, behaviour, .. } = &self.networks;
         let fresh = |i| PolicyState::of_slot(world, &self.config, self.spec.action_size, i);
         let start = self.slots.state(slot.index, fresh).latent.repeated(0, SHOWN);
-        let rollout = behaviour.imagine(world, &start, &mut rng::stream(0, "dreamer foresight"));
+        let rollout = behaviour.imagine(world, &start, &mut rng::stream(0, "dreamer imagined"));
         let decoded: Vec<Vec<f32>> = rollout.features.iter().map(|features| world.decode(features)).collect();
         let width = slot.obs.len();
         let trajectories = (0..SHOWN).map(|i| ImaginedTrajectory {

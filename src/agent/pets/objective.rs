@@ -71,7 +71,7 @@ impl<'a> PlanningModel<'a> {
     pub(super) fn imagine_trajectories(&self, obs: &[f32], sequences: &ActionSequences) -> Vec<ImaginedTrajectory> {
         let imagination = self.imagination();
         let (states, imagined) =
-            imagination.trajectories(obs, &sequences.values, sequences.horizon, &mut rng::stream(0, "pets foresight"));
+            imagination.trajectories(obs, &sequences.values, sequences.horizon, &mut rng::stream(0, "pets imagined"));
         let (width, count, particles) = (obs.len(), sequences.count(), imagined.particles);
         let at = |t: usize, p: usize, c: usize| &states[t][(p * count + c) * width..][..width];
         let mean = |t: usize, c: usize| -> Vec<f32> {
