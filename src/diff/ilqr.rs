@@ -250,7 +250,8 @@ fn forward<const N: usize, const M: usize>(
 }
 
 /// The box-constrained quadratic program of box-DDP (Tassa et al. 2014): the x within bounds that minimises x' H x / 2 + g' x,
-/// and which of its numbers are free (not held at a bound), by projected Newton steps. None if H is not positive definite among the free ones.
+/// and which of its numbers are free (not held at a bound), by projected Newton steps. None if H is not positive definite among the
+/// free ones.
 fn box_qp<const M: usize>(
     h: &SMatrix<f64, M, M>,
     g: &SVector<f64, M>,
