@@ -141,15 +141,16 @@ pub fn failure(executed: &Value) -> Option<String> {
     for (i, cell) in executed["cells"].as_array().into_iter().flatten().enumerate() {
         for output in cell["outputs"].as_array().into_iter().flatten() {
             let text = joined(&output["text"]);
-            // Instead of drawing a chart, the kernel prints its `Debug` form if the cell moved a variable into it.
-            let undrawn = joined(&output["data"]["text/plain"]).starts_with("Chart {");
+            // Instead of drawing a chart or a replay, the kernel prints its `Debug` form if the cell moved a variable into it.
+            let plain = joined(&output["data"]["text/plain"]);
+            let undrawn = ["Chart {", "Recording {"].iter().any(|form| plain.starts_with(form));
             let wrong = undrawn
                 || output["output_type"] == "error"
                 || output["name"] == "stderr" && (text.contains("panicked at") || text.contains("terminated with"));
             if wrong {
                 let said = match text.is_empty() {
                     _ if undrawn => {
-                        "the chart as text instead of a picture: pass clones of the notebook's variables to it".into()
+                        "the chart or replay as text instead of a picture: pass clones of the notebook's variables to it".into()
                     }
                     true => joined(&output["traceback"]),
                     false => text,

@@ -113,8 +113,9 @@ fn mathml(latex: &str, display_mode: DisplayMode) -> anyhow::Result<String> {
     let events = events.map_err(|error| anyhow::anyhow!("formula `{latex}`: {error}"))?;
     let mut html = String::new();
     push_mathml(&mut html, events.into_iter().map(Ok::<_, std::convert::Infallible>), config)?;
-    // Escapes what has a meaning in Markdown: two tildes, for example, would strike out the text between them.
-    let escapes = [("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")];
+    // The renderer escapes the entity that it writes for a space (`\ `); and what has a meaning in Markdown is escaped: two tildes,
+    // for example, would strike out the text between them.
+    let escapes = [("&amp;nbsp;", "&#160;"), ("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")];
     Ok(escapes.into_iter().fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
 }
 
@@ -130,6 +131,8 @@ mod tests {
         assert!(formulas("$\\frac{1$").is_err(), "a formula that is not closed");
         let tildes = formulas("$\\tilde a + \\tilde b$").expect("a formula");
         assert!(!tildes.contains('~') && tildes.contains("&#126;"), "{tildes}");
+        let space = formulas("$a,\\ b$").expect("a formula");
+        assert!(!space.contains("nbsp") && space.contains("&#160;"), "{space}");
     }
 
     #[test]

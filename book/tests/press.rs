@@ -230,8 +230,9 @@ fn stale_and_failed_notebooks_are_found() {
         json!([{ "output_type": "stream", "name": "stderr", "text": ["thread panicked at src/lib.rs:2:1:\n"] }]);
     executed["cells"][2]["outputs"] = panic;
     assert!(notebook::failure(&executed).expect("a panic").contains("assert!(1 + 1 == 2);"));
-    executed["cells"][2]["outputs"] =
-        json!([{ "output_type": "execute_result", "data": { "text/plain": "Chart { x" } }]);
-    assert!(notebook::failure(&executed).expect("not drawn").contains("the chart as text"));
+    for form in ["Chart { x", "Recording { x"] {
+        executed["cells"][2]["outputs"] = json!([{ "output_type": "execute_result", "data": { "text/plain": form } }]);
+        assert!(notebook::failure(&executed).expect("not drawn").contains("as text instead of a picture"));
+    }
     std::fs::remove_dir_all(&folder).expect("removed");
 }

@@ -30,7 +30,8 @@ pub struct PetsConfig {
     /// Return subtracted for each unit of disagreement between the members
     /// ([`ImaginedReturns::disagreement`](crate::model::ImaginedReturns)).
     pub disagreement_penalty: f32,
-    /// Return added for each unit of disagreement, in [`Mode::Explore`](crate::agent::Mode) only.
+    /// Return added for each unit of disagreement, in [`Mode::Explore`](crate::agent::Mode) only. The penalty is subtracted there,
+    /// too: if both are equal, exploration is neutral.
     #[doc(alias = "curiosity")]
     pub disagreement_bonus: f32,
     /// Time steps of random actions before the first fit.
