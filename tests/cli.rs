@@ -128,9 +128,8 @@ fn a_small_study_from_start_to_report() {
     );
 
     // A second time, nothing is run again, and the table is the same.
-    let start = Instant::now();
     let again = handful(here, &study);
-    assert!(again.status.success() && start.elapsed() < Duration::from_secs(10));
+    assert!(again.status.success(), "{}", text(&again.stderr));
     assert_eq!(text(&again.stdout), table);
     assert!(!text(&again.stderr).contains("started"), "{}", text(&again.stderr));
 

@@ -8,7 +8,6 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{Checkpoint, Policy, Slot, Slots};
-use crate::checkpoint::Weights;
 use crate::env::{Env, Snapshot};
 use crate::error::{Error, Result};
 use crate::plan::{ActionSequences, ControlConfig, IcemConfig, MakePlanner, PlannerConfig, RecedingHorizon};
@@ -59,10 +58,11 @@ pub struct Oracle<E: Env + Snapshot> {
     config: OracleConfig,
     planner: Box<dyn MakePlanner>,
     action_size: usize,
-    controllers: Slots<RecedingHorizon>,
+    /// The controller of each slot, with its random numbers.
+    controllers: Slots<(RecedingHorizon, Rng)>,
     /// Environments to try action sequences in, one for each thread.
     simulators: Vec<E>,
-    rng: Rng,
+    seed: u64,
 }
 
 impl<E: Env + Snapshot> Oracle<E> {
@@ -80,7 +80,7 @@ impl<E: Env + Snapshot> Oracle<E> {
             config,
             controllers: Slots::default(),
             simulators,
-            rng: rng::stream(seed, "oracle"),
+            seed,
         })
     }
 
@@ -90,16 +90,18 @@ impl<E: Env + Snapshot> Oracle<E> {
         Self { planner: Box::new(planner), controllers: Slots::default(), ..self }
     }
 
-    /// A new episode begins in the slot `index`: its plan is dropped.
+    /// A new episode begins in the slot `index`: its plan is dropped, and its random numbers begin anew.
     pub fn begin_episode(&mut self, index: usize) {
         self.controllers.clear(index);
     }
 
     /// The action to take in `state`, in the slot `index` (0 if there is one environment only).
     pub fn plan(&mut self, index: usize, state: &E::State) -> Vec<f32> {
-        let Self { config, planner, action_size, controllers, simulators, rng } = self;
-        let new = |_| RecedingHorizon::new(planner.make(*action_size), *action_size, &config.control);
-        let controller = controllers.state(index, new);
+        let Self { config, planner, action_size, controllers, simulators, seed } = self;
+        let (controller, rng) = controllers.state(index, |index| {
+            let controller = RecedingHorizon::new(planner.make(*action_size), *action_size, &config.control);
+            (controller, rng::stream(*seed, &format!("oracle, slot {index}")))
+        });
         let mut objective =
             |candidates: &ActionSequences| returns(simulators, state, candidates, config.terminal_weight);
         controller.act(&mut objective, &mut |_| {}, rng)
@@ -162,15 +164,4 @@ impl<E: Env + Snapshot> Policy for Oracle<E> {
     }
 }
 
-impl<E: Env + Snapshot> Checkpoint for Oracle<E> {
-    fn training_state(&self) -> Weights {
-        let mut state = Weights::default();
-        state.insert_rng("rng", &self.rng);
-        state
-    }
-
-    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        self.rng = state.rng("rng")?;
-        Ok(())
-    }
-}
+impl<E: Env + Snapshot> Checkpoint for Oracle<E> {}
