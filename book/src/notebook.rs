@@ -51,8 +51,10 @@ fn code_cell(id: &str, code: &str, folded: bool) -> Value {
 }
 
 /// In Jupyter, `<details>` cannot extend over several cells, so it is removed here; the code cell itself is folded instead.
+/// GitHub's alerts (`> [!NOTE]`), which Jupyter does not know, become quotations.
 fn unfolded(text: &str) -> String {
-    let kept = text.lines().filter(|line| *line != "</details>").map(|line| {
+    let dropped = |line: &str| line == "</details>" || line.starts_with("> [!");
+    let kept = text.lines().filter(|line| !dropped(line)).map(|line| {
         match line.strip_prefix("<details>").and_then(|line| line.trim().strip_prefix("<summary>")) {
             Some(summary) => format!("**{}** (unfold the cell below)", summary.trim_end_matches("</summary>")),
             None => line.to_string(),

@@ -206,7 +206,9 @@ fn a_chapter_is_taken_apart_and_its_program_keeps_the_lines() {
 fn stale_and_failed_notebooks_are_found() {
     let folder = std::env::temp_dir().join(format!("handful-press-{}", std::process::id()));
     std::fs::create_dir_all(&folder).expect("a folder");
-    let chapter = Chapter::parse("t", "# T\n\n```rust\nassert!(1 + 1 == 2);\n```\n").expect("a chapter");
+    let chapter = "# T\n> [!NOTE]\n> Two.\n\n```rust\nassert!(1 + 1 == 2);\n```\n";
+    let chapter = Chapter::parse("t", chapter).expect("a chapter");
+    assert_eq!(notebook::generate(&chapter)["cells"][1]["source"], json!(["# T\n", "> Two."]), "Jupyter has no alerts");
     let missing = notebook::complaint(&chapter, &folder).expect("there is no notebook");
     assert!(missing.contains("cargo book notebooks t"), "{missing}");
 
