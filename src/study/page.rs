@@ -9,7 +9,7 @@ use flate2::write::GzEncoder;
 use pulldown_cmark::{CowStr, Event, Options, Parser, Tag, TagEnd, html};
 
 use crate::error::{Error, Result};
-use crate::watch;
+use crate::watch::{self, escaped};
 
 const STYLE: &str = include_str!("page.css");
 const REPLAYS: &str = include_str!("replays.js");
@@ -54,10 +54,7 @@ pub(super) fn page(markdown: &str, folder: &Path) -> Result<String> {
     let mut body = String::new();
     html::push_html(&mut body, events.into_iter());
     if !recordings.is_empty() {
-        let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
-        gzip.write_all(watch::empty_page().as_bytes()).expect("memory takes everything");
-        let empty_page = gzip.finish().expect("memory takes everything");
-        recordings += &embedded("replay-page", &empty_page);
+        recordings += &embedded("replay-page", &gzip(&watch::empty_page()));
         recordings += &format!("<script type=\"module\">\n{REPLAYS}</script>\n");
     }
     Ok(format!(
@@ -72,8 +69,10 @@ fn embedded(id: &str, gzip: &[u8]) -> String {
     format!("<script type=\"application/gzip;base64\" id=\"{id}\">{bytes}</script>\n")
 }
 
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
+/// Compresses a text; the page's script unpacks it.
+pub(super) fn gzip(text: &str) -> Vec<u8> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(text.as_bytes()).and_then(|()| encoder.finish()).expect("memory takes everything")
 }
 
 fn text(event: Event) -> Option<CowStr> {

@@ -1,17 +1,15 @@
 //! The episodes that a report shows in 3D: of each method's median seed, the test episode with the median return and the one with
 //! the lowest. Weights are not in a study's tables, so the episodes are recorded when the study ends, next to the tables.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use flate2::Compression;
-use flate2::write::GzEncoder;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use serde::{Deserialize, Serialize};
 
 use super::config::RunConfig;
 use super::evaluate::{ENVS, EpisodeResult};
-use super::folder::is_complete;
+use super::folder::{is_complete, read_summary};
+use super::page::gzip;
 use super::records::write_csv;
 use super::registry::Registry;
 use crate::error::{Error, Result};
@@ -136,19 +134,15 @@ fn chosen(runs: &[(RunConfig, PathBuf)]) -> Vec<(Replay, &Path)> {
     struct Tested<'a> {
         config: &'a RunConfig,
         folder: &'a Path,
-        results: Vec<EpisodeResult>,
-    }
-    impl Tested<'_> {
         /// Success rate, then mean return.
-        fn quality(&self) -> [f64; 2] {
-            let sum =
-                |of: fn(&EpisodeResult) -> f64| self.results.iter().map(of).sum::<f64>() / self.results.len() as f64;
-            [sum(|result| f64::from(u8::from(result.success))), sum(|result| result.total)]
-        }
+        quality: [f64; 2],
+        results: Vec<EpisodeResult>,
     }
     let tested = runs.iter().filter(|(config, folder)| is_complete(folder, config)).filter_map(|(config, folder)| {
         let results = rows::<EpisodeResult>(&folder.join("test.csv")).ok()?;
-        (!results.is_empty()).then_some(Tested { config, folder, results })
+        let summary = read_summary(folder).ok()?;
+        let quality = [summary.success, summary.return_mean];
+        (!results.is_empty()).then_some(Tested { config, folder, quality, results })
     });
     let mut methods: Vec<Vec<Tested>> = Vec::new();
     for run in tested {
@@ -161,8 +155,8 @@ fn chosen(runs: &[(RunConfig, PathBuf)]) -> Vec<(Replay, &Path)> {
     let mut episodes = Vec::new();
     for mut seeds in methods {
         let middle = (seeds.len() - 1) / 2;
-        seeds.sort_by(|a, b| a.quality().partial_cmp(&b.quality()).expect("returns are finite"));
-        let Tested { config, folder, results } = seeds.swap_remove(middle);
+        seeds.sort_by(|a, b| a.quality.partial_cmp(&b.quality).expect("returns are finite"));
+        let Tested { config, folder, results, .. } = seeds.swap_remove(middle);
         let mut order: Vec<usize> = (0..results.len()).collect();
         order.sort_by(|&a, &b| results[a].total.total_cmp(&results[b].total));
         for (which, name, at) in [(Which::Median, "median", (order.len() - 1) / 2), (Which::Worst, "worst", 0)] {
@@ -203,6 +197,5 @@ fn recording(registry: &Registry, replay: &Replay, run: &Path) -> Result<Vec<u8>
             replay.total
         )));
     }
-    let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
-    gzip.write_all(recording.to_json().as_bytes()).and_then(|()| gzip.finish()).map_err(Error::io("compress", run))
+    Ok(gzip(&recording.to_json()))
 }

@@ -141,10 +141,7 @@ impl Recording {
 
     /// The page.
     pub fn to_html(&self) -> String {
-        let escape =
-            |text: &str| text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;");
-        let (title, json) = (escape(&self.title), self.to_json());
-        filled(&[("title", &title), ("recording", &json), ("three", THREE), ("viewer", VIEWER)])
+        filled(&escaped(&self.title), &self.to_json())
     }
 
     /// Shows it in a notebook, in a frame of its own; called by the kernel.
@@ -169,20 +166,28 @@ impl Recording {
 /// recording belong.
 #[cfg(feature = "study")]
 pub(crate) fn empty_page() -> String {
-    filled(&[("three", THREE), ("viewer", VIEWER)])
+    filled("{{title}}", "{{recording}}")
 }
 
-/// The page with some of its parts filled in; what has been filled in is not searched again.
-fn filled(parts: &[(&str, &str)]) -> String {
+/// Text as HTML shows it, also within an attribute.
+pub(crate) fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// The page with its parts. One pass: what has been filled in is not searched again.
+fn filled(title: &str, recording: &str) -> String {
     let mut page = String::new();
     let mut rest = PAGE;
     while let Some((before, after)) = rest.split_once("{{") {
         let (name, after) = after.split_once("}}").expect("placeholders are closed");
         page.push_str(before);
-        match parts.iter().find(|(part, _)| *part == name) {
-            Some((_, content)) => page.push_str(content),
-            None => page.extend(["{{", name, "}}"]),
-        }
+        page.push_str(match name {
+            "title" => title,
+            "recording" => recording,
+            "three" => THREE,
+            "viewer" => VIEWER,
+            other => panic!("the page has no part called {other}"),
+        });
         rest = after;
     }
     page + rest
