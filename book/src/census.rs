@@ -61,47 +61,41 @@ struct Record {
 
 type Records = BTreeMap<(String, String), Record>;
 
-/// Runs every test under the shakes `1..=shakes`, with the AVX-512 kernels and with those for AVX2, and writes the table. What
-/// was run before with the same programs is not run again. A failure ends the command with an error, after the table is written.
+/// Runs every test under the shakes `1..=shakes` and writes the table. (One kind of kernels is enough: all compute the same bits, as
+/// `.ci/run` checks.) What was run before with the same programs is not run again. A failure ends the command with an error, after
+/// the table is written.
 ///
 /// If there are `names`, only the programs and tests whose name contains one of them are run, and the other rows stay.
 pub fn take(root: &Path, shakes: u16, names: &[String]) -> Result<()> {
     let began = Instant::now();
     let commit = commit(root)?;
-    let mut columns = Vec::new();
-    for (kernels, features) in [("AVX-512", "avx512,cli,study"), ("AVX2", "cli,study")] {
-        let mut records = Records::new();
-        let programs = build(root, features)?;
-        let jobs: Vec<Job> = (1..=shakes)
-            .flat_map(|shake| programs.iter().filter_map(move |program| Job::new(program, shake, names)))
-            .collect();
-        for (job, output) in jobs.iter().zip(outputs(root, &jobs)) {
-            count(&mut records, &job.program.source, job.shake, &output?)?;
-        }
-        columns.push((kernels, records));
+    let programs = build(root)?;
+    let jobs: Vec<Job> = (1..=shakes)
+        .flat_map(|shake| programs.iter().filter_map(move |program| Job::new(program, shake, names)))
+        .collect();
+    let mut records = Records::new();
+    for (job, output) in jobs.iter().zip(outputs(root, &jobs)) {
+        count(&mut records, &job.program.source, job.shake, &output?)?;
     }
     let path = root.join(PAGE);
     let page = fs::read_to_string(&path).context(PAGE)?;
     let (before, rest) = page.split_once(BEGIN).with_context(|| format!("{PAGE} lacks `{BEGIN}`"))?;
     let (table, after) = rest.split_once(END).with_context(|| format!("{PAGE} lacks `{END}`"))?;
     let mut rows = if names.is_empty() { BTreeMap::new() } else { rows_of(table) };
-    rows.append(&mut rows_of_census(&columns, &commit));
-    let kernels: Vec<&str> = columns.iter().map(|(kernels, _)| *kernels).collect();
-    let mut table =
-        format!("| test | {} | commit |\n| --- |{}\n", kernels.join(" | "), " --- |".repeat(kernels.len() + 1));
+    rows.append(&mut rows_of_census(&records, &commit));
+    let mut table = String::from("| test | passed | commit |\n| --- | --- | --- |\n");
     rows.iter().for_each(|(label, cells)| table.push_str(&format!("| {label} | {cells} |\n")));
     fs::write(&path, format!("{before}{BEGIN}\n\n{table}\n{END}{after}"))?;
     println!("{PAGE} written; {:.0} minutes", began.elapsed().as_secs_f64() / 60.0);
-    let failed: Vec<String> = columns.iter().flat_map(|(kernels, records)| failures(kernels, records)).collect();
+    let failed = failures(&records);
     ensure!(failed.is_empty(), "not every claim holds:\n{}", failed.join("\n"));
     Ok(())
 }
 
-/// Builds all tests but those of the documentation, into a folder for these features.
-fn build(root: &Path, features: &str) -> Result<Vec<Program>> {
+/// Builds all tests but those of the documentation.
+fn build(root: &Path) -> Result<Vec<Program>> {
     let output = Command::new("cargo")
         .args(["test", "--locked", "--no-run", "--lib", "--bins", "--tests", "--message-format=json"])
-        .args(["--no-default-features", "--features", features])
         .current_dir(root)
         .stderr(std::process::Stdio::inherit())
         .output()
@@ -196,9 +190,9 @@ fn reason(output: &str, test: &str) -> String {
     format!("{place} {}", lines.next().unwrap_or_default())
 }
 
-fn failures(kernels: &str, records: &Records) -> Vec<String> {
+fn failures(records: &Records) -> Vec<String> {
     let of_test = |((source, test), record): (&(String, String), &Record)| -> Vec<String> {
-        let line = |(shake, why): (&u16, &String)| format!("{kernels}, HANDFUL_SHAKE={shake}: {source}, {test}: {why}");
+        let line = |(shake, why): (&u16, &String)| format!("HANDFUL_SHAKE={shake}: {source}, {test}: {why}");
         record.failures.iter().map(line).collect()
     };
     records.iter().flat_map(of_test).collect()
@@ -222,27 +216,17 @@ fn rows_of(table: &str) -> BTreeMap<String, String> {
 }
 
 /// One row for each test of `tests/` and each chapter, one for all unit tests of a program.
-fn rows_of_census(columns: &[(&str, Records)], commit: &str) -> BTreeMap<String, String> {
-    let mut rows = BTreeMap::<String, Vec<&(String, String)>>::new();
-    let tests: BTreeSet<&(String, String)> = columns.iter().flat_map(|(_, records)| records.keys()).collect();
-    for test in tests {
-        let (program, name) = test;
+fn rows_of_census(records: &Records, commit: &str) -> BTreeMap<String, String> {
+    let mut rows = BTreeMap::<String, (usize, BTreeSet<u16>)>::new();
+    for ((program, name), record) in records {
         let label =
             if program.contains("tests/") { format!("{program}: `{name}`") } else { format!("{program}: unit tests") };
-        rows.entry(label).or_default().push(test);
+        let (all, failed) = rows.entry(label).or_default();
+        *all = record.shakes.max(*all);
+        failed.extend(record.failures.keys());
     }
-    let cells = |tests: Vec<&(String, String)>| {
-        let held = columns.iter().map(|(_, records)| {
-            let (mut all, mut failed) = (0, BTreeSet::<u16>::new());
-            for record in tests.iter().filter_map(|test| records.get(test)) {
-                all = all.max(record.shakes);
-                failed.extend(record.failures.keys());
-            }
-            format!("{} of {all}", all - failed.len())
-        });
-        format!("{} | {commit}", held.collect::<Vec<_>>().join(" | "))
-    };
-    rows.into_iter().map(|(label, tests)| (label, cells(tests))).collect()
+    let cells = |(all, failed): (usize, BTreeSet<u16>)| format!("{} of {all} | {commit}", all - failed.len());
+    rows.into_iter().map(|(label, row)| (label, cells(row))).collect()
 }
 
 #[cfg(test)]
@@ -260,13 +244,14 @@ mod tests {
         count(&mut records, "tests/learning.rs", 1, good).expect("a whole output");
         count(&mut records, "tests/learning.rs", 2, bad).expect("a whole output");
         assert_eq!(
-            failures("AVX2", &records),
-            ["AVX2, HANDFUL_SHAKE=2: tests/learning.rs, learns: learning.rs:98:5: mean return -300"]
+            failures(&records),
+            ["HANDFUL_SHAKE=2: tests/learning.rs, learns: learning.rs:98:5: mean return -300"]
         );
-        let rows = rows_of_census(&[("AVX2", records)], "abc");
+        let rows = rows_of_census(&records, "abc");
         let expected = [("learns", "1 of 2 | abc"), ("plans", "2 of 2 | abc")];
         assert_eq!(rows, expected.map(|(test, cells)| (format!("tests/learning.rs: `{test}`"), cells.into())).into());
-        let table = "\n| test | AVX2 | commit |\n| --- | --- | --- |\n| tests/learning.rs: `plans` | 2 of 2 | abc |\n";
+        let table =
+            "\n| test | passed | commit |\n| --- | --- | --- |\n| tests/learning.rs: `plans` | 2 of 2 | abc |\n";
         assert_eq!(rows_of(table), [("tests/learning.rs: `plans`".into(), "2 of 2 | abc".into())].into());
         assert!(count(&mut Records::new(), "tests/learning.rs", 3, "\ntest learns ... ok\n").is_err(), "it broke off");
     }

@@ -12,6 +12,10 @@ use super::{Object, Physics, SIDES, TABLE_HALF, TABLE_TOP, TIMESTEP};
 use crate::env::arm::{ArmDescription, Inertia, JOINTS, Pose, Primitive, PrimitiveKind};
 use crate::env::kinematics::{GRAVITY, KinematicModel};
 
+/// The stops of the arm's hinges are critically damped springs with the time constant of MuJoCo's (its default `solref`, 0.02 s). With rigid
+/// ones, an arm that is wedged between a stop and an obstacle would store any amount of energy, to release it at once.
+const HINGE_STOP: SpringCoefficients<f32> = SpringCoefficients { natural_frequency: 8.0, damping_ratio: 1.0 };
+
 impl Physics {
     /// A table with `arm` beside it, at its home posture.
     pub fn new(arm: ArmDescription) -> Self {
@@ -59,7 +63,8 @@ impl Physics {
             let joint = GenericJointBuilder::new(JointAxesMask::LOCKED_REVOLUTE_AXES)
                 .local_frame1(to_rapier(&(link.mount * hinge)))
                 .local_frame2(to_rapier(&hinge))
-                .limits(JointAxis::AngX, link.range.map(|limit| limit as f32));
+                .limits(JointAxis::AngX, link.range.map(|limit| limit as f32))
+                .softness(HINGE_STOP);
             handles.push(world.insert_multibody_joint(parent, body, joint.build()).expect("a chain has no loops"));
             parent = body;
             body

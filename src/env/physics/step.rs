@@ -129,3 +129,42 @@ impl Physics {
 pub(crate) fn dry_friction<S: RealField + Copy>(friction: S, armature: S, velocity: S, force: S) -> S {
     (armature * velocity / convert(TIMESTEP) + force).clamp(-friction, friction)
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::super::convert::from_vector;
+    use super::*;
+    use crate::env::arm::{ArmDescription, Pose, Primitive};
+
+    /// A ball pushes the forearm of the folded arm towards the shoulder, against the stop of the elbow. The axes of the shoulder's
+    /// three joints meet in a point, so none of them yields. With a rigid stop, joints reached 100 rad/s.
+    #[test]
+    fn an_arm_that_is_wedged_against_a_stop_does_not_explode() {
+        const RADIUS: f64 = 0.05;
+        for overlap in [0.002, 0.01, 0.03] {
+            let mut physics = Physics::new(ArmDescription::panda());
+            let mut folded = physics.arm().home;
+            folded[3] = physics.arm().links[3].range[0];
+            physics.set_joints(&folded, [0.0; 2]);
+
+            let forearm = &physics.world.bodies[physics.links[4]];
+            let shape = &physics.world.colliders[forearm.colliders()[0]];
+            let place = *forearm.position() * *shape.position_wrt_parent().expect("it belongs to the forearm");
+            let middle = from_vector(place.translation);
+            let shoulder = from_vector(physics.world.bodies[physics.links[1]].translation());
+            let outwards: Vector3<f64> = (middle - shoulder).normalize();
+            let radius = f64::from(shape.shape().as_capsule().expect("a capsule").radius);
+            let ball = middle + outwards * (radius + RADIUS - overlap);
+            physics.add_fixed(&[Primitive::ball(RADIUS, [0.0; 3])], 1.0, &Pose::translation(ball.x, ball.y, ball.z));
+
+            let mut fastest = 0.0_f64;
+            for _ in 0..800 {
+                physics.step(&JointVector::zeros(), [0.0; 2]);
+                fastest = fastest.max(physics.joint_state().qd.amax());
+            }
+            assert!(fastest < 6.0, "with {overlap} m of overlap a joint turns at {fastest} rad/s");
+        }
+    }
+}
