@@ -68,9 +68,9 @@
 //!
 //! # A map of the crate
 //!
-//! A module uses only its own floor and the floors below it; a test holds that.
+//! A module uses only its own layer and the layers below it; a test holds that.
 //!
-//! | floor | module | what is in it |
+//! | layer | module | what is in it |
 //! | --- | --- | --- |
 //! | 4 | `cli` | the command line, for any registry (feature `cli`) |
 //! | 3 | [`study`] | evaluation protocol, runs, registry, statistics, tables, figures, reports |

@@ -1,19 +1,19 @@
-//! The map in `src/lib.rs` is true: a module imports only from its own floor and the floors below it.
+//! The map in `src/lib.rs` is true: a module imports only from its own layer and the layers below it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The floor of each module, as the table in `lib.rs` has it: `| floor | [`module`], ... | ... |`.
-fn floors() -> BTreeMap<String, u32> {
+/// The layer of each module, as the table in `lib.rs` has it: `| layer | [`module`], ... | ... |`.
+fn layers() -> BTreeMap<String, u32> {
     let text = std::fs::read_to_string("src/lib.rs").expect("the crate's root");
     let rows = text.lines().filter_map(|line| line.strip_prefix("//! | ")).filter_map(|row| {
         let mut cells = row.split('|').map(str::trim);
-        let floor: u32 = cells.next()?.parse().ok()?;
-        Some((floor, cells.next()?.to_string()))
+        let layer: u32 = cells.next()?.parse().ok()?;
+        Some((layer, cells.next()?.to_string()))
     });
-    let names = rows.flat_map(|(floor, modules)| {
+    let names = rows.flat_map(|(layer, modules)| {
         let names = modules.split('`').skip(1).step_by(2).map(String::from).collect::<Vec<_>>();
-        names.into_iter().map(move |name| (name, floor))
+        names.into_iter().map(move |name| (name, layer))
     });
     names.collect()
 }
@@ -61,8 +61,8 @@ fn imports(text: &str) -> Vec<String> {
 
 #[test]
 fn a_module_imports_only_from_floors_below() {
-    let floors = floors();
-    assert!(floors.len() >= 14, "the map names every module: {floors:?}");
+    let layers = layers();
+    assert!(layers.len() >= 14, "the map names every module: {layers:?}");
     let mut files = Vec::new();
     sources(Path::new("src"), &mut files);
     assert!(files.len() > 60, "the whole crate");
@@ -72,10 +72,10 @@ fn a_module_imports_only_from_floors_below() {
         if ["lib", "bin"].contains(&module.as_str()) {
             continue;
         }
-        let own = floors.get(&module).unwrap_or_else(|| panic!("`{module}` is not on the map in src/lib.rs"));
+        let own = layers.get(&module).unwrap_or_else(|| panic!("`{module}` is not on the map in src/lib.rs"));
         for import in imports(&std::fs::read_to_string(&file).expect("a source file")) {
-            if let Some(floor) = floors.get(&import) {
-                assert!(floor <= own, "{}: `{module}` (floor {own}) uses `{import}` (floor {floor})", file.display());
+            if let Some(layer) = layers.get(&import) {
+                assert!(layer <= own, "{}: `{module}` (layer {own}) uses `{import}` (layer {layer})", file.display());
             }
         }
     }

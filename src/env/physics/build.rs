@@ -12,8 +12,9 @@ use super::{Object, Physics, SIDES, TABLE_HALF, TABLE_TOP, TIMESTEP};
 use crate::env::arm::{ArmDescription, Inertia, JOINTS, Pose, Primitive, PrimitiveKind};
 use crate::env::kinematics::{GRAVITY, KinematicModel};
 
-/// The stops of the arm's hinges are critically damped springs with the time constant of MuJoCo's (its default `solref`, 0.02 s). With rigid
-/// ones, an arm that is wedged between a stop and an obstacle would store any amount of energy, to release it at once.
+/// The stops of the arm's hinges are critically damped springs with the time constant of MuJoCo's (its default `solref`,
+/// 0.02 s). With rigid ones, an arm that is wedged between a stop and an obstacle would store any amount of energy, to
+/// release it at once.
 const HINGE_STOP: SpringCoefficients<f32> = SpringCoefficients { natural_frequency: 8.0, damping_ratio: 1.0 };
 
 impl Physics {
