@@ -60,7 +60,7 @@ fn imports(text: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_module_imports_only_from_floors_below() {
+fn a_module_imports_only_from_layers_below() {
     let layers = layers();
     assert!(layers.len() >= 14, "the map names every module: {layers:?}");
     let mut files = Vec::new();
