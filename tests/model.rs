@@ -273,7 +273,7 @@ fn a_model_is_judged_over_many_steps() {
     let horizons: Vec<usize> = measured.iter().map(|row| row.horizon).collect();
     assert_eq!(horizons, [1, 2, 5, 10, 15, 25]);
     for row in measured {
-        assert!(row.rmse < 0.5, "better than foreseeing no change: {row:?}");
+        assert!(row.rmse < 0.5, "better than predicting no change: {row:?}");
         // One step ahead 0.9; over many steps errors accumulate, and members agree more than they should.
         assert!(row.coverage90.is_some_and(|share| (0.6..=1.0).contains(&share)), "{row:?}");
     }
@@ -298,14 +298,14 @@ fn moments(episodes: &[Episode]) -> SequenceReplay {
 }
 
 #[test]
-fn latent_models_foresee_too() {
+fn latent_models_predict_too() {
     let mut rng = rng::stream(6, "model");
     let (_, episodes) = experience(2000, &mut rng);
     let (_, unseen) = experience(500, &mut rng);
     let data = moments(&episodes);
     let better = |name: &str, measured: Vec<OpenLoop>| {
         let five = measured.iter().find(|row| row.horizon == 5).expect("five steps");
-        assert!(five.rmse < 0.8, "{name}: better than foreseeing no change: {five:?}");
+        assert!(five.rmse < 0.8, "{name}: better than predicting no change: {five:?}");
     };
 
     let config = AutoencoderConfig { code: 8, hidden: vec![32, 32] };
