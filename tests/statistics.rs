@@ -17,7 +17,8 @@ use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
     area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
-    probability_of_improvement, ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
+    probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean, steps_to, t_interval,
+    two_level_bootstrap, welch_interval, wilson,
 };
 use rayon::prelude::*;
 
@@ -202,6 +203,25 @@ fn paired_differences() {
     check("starts that one of them met", vec![[all, vec![0.0; 30]].concat()], vec![none], [1.0, 1.0, 1.0]);
 }
 
+/// Means 0.9 and 0.5, three seeds each with a variance of 0.01; the quantile for two degrees of freedom is 4.3027.
+#[test]
+fn t_intervals_of_two_methods() {
+    let (first, second) = ([0.8, 0.9, 1.0], [0.4, 0.5, 0.6]);
+    let [low, high] = welch_interval(&first, &second).expect("three seeds each");
+    near("low", low, 0.4 - 0.351_312, 1e-5);
+    near("high", high, 0.4 + 0.351_312, 1e-5);
+    // Relative standard errors 0.057735 / 0.9 and 0.057735 / 0.5.
+    let [low, high] = ratio_t_interval(&first, &second).expect("three seeds each");
+    let factor = (4.3027 * 0.064_150_f64.hypot(0.115_470)).exp();
+    near("ratio from", low, 1.8 / factor, 1e-4);
+    near("ratio to", high, 1.8 * factor, 1e-4);
+    // The fewer seeds decide.
+    let more = [0.3, 0.4, 0.5, 0.6, 0.7];
+    let wide = welch_interval(&first, &more).expect("three and five seeds");
+    near("width", (wide[1] - wide[0]) / 2.0, 4.3027 * (0.01 / 3.0 + 0.025 / 5.0_f64).sqrt(), 1e-9);
+    assert_eq!(welch_interval(&first, &[0.5]), None, "one seed says nothing about others");
+}
+
 /// A study by hand: `dreamer` with five seeds, one of which fails, `pets` with two, `sac` with one.
 #[test]
 fn a_summary_says_what_its_seeds_can_tell() {
@@ -268,10 +288,10 @@ fn a_summary_says_what_its_seeds_can_tell() {
     let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
-        "| 1000 (12 s) | 2.50 |",
-        "- **pole**: `dreamer` is first at 80 % success, by step 1000. Fewer steps to it than `sac`: `pets`. Seeds that never get \
-         there, so no ratio to `sac`: `dreamer`. Higher final success than `sac`: `pets`. No certain difference in final success \
-         from `sac`: `dreamer`.",
+        "| 1000 (12 s) | 2.5 |",
+        "- **pole**\n  - `dreamer` is first at 80 % success, by step 1000 (median).\n  - Significantly fewer steps to 80 % than `sac`: \
+         `pets`. Not every seed gets there within the budget, so no ratio to `sac`: `dreamer`.\n  - Significantly more success in the \
+         test than `sac`: `pets`. No significant difference in the test from `sac`: `dreamer`.\n",
         "one seed: the interval covers its test episodes, not what another seed would bring",
         "minus that of `sac`: +50 percentage points [",
         "takes at least 2.0 times as many steps",

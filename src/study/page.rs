@@ -51,6 +51,7 @@ pub(super) fn page(markdown: &str, folder: &Path) -> Result<String> {
             event => events.push(event),
         }
     }
+    let title = escaped(markdown.lines().next().unwrap_or_default().trim_start_matches("# "));
     let mut body = String::new();
     html::push_html(&mut body, events.into_iter());
     if !recordings.is_empty() {
@@ -58,7 +59,7 @@ pub(super) fn page(markdown: &str, folder: &Path) -> Result<String> {
         recordings += &format!("<script type=\"module\">\n{REPLAYS}</script>\n");
     }
     Ok(format!(
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>Comparison</title>\n<meta name=\"viewport\" \
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>{title}</title>\n<meta name=\"viewport\" \
          content=\"width=device-width, initial-scale=1\">\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n{recordings}</body>\n</html>\n"
     ))
 }
@@ -82,11 +83,14 @@ fn text(event: Event) -> Option<CowStr> {
     }
 }
 
-/// A figure in the page itself, with what it shows for those who do not see it.
+/// A figure in the page itself, with its caption. On a narrow screen it scrolls, so that its text stays legible.
 fn figure(path: &Path, caption: &str) -> Result<String> {
     let svg = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
-    let label = escaped(caption);
-    Ok(format!("<span class=\"figure\" role=\"img\" aria-label=\"{label}\">{svg}</span>"))
+    let caption = escaped(caption);
+    Ok(format!(
+        "<span class=\"figure\"><span class=\"drawing\" role=\"img\" aria-label=\"{caption}\">{svg}</span>\
+         <span class=\"caption\">{caption}.</span></span>"
+    ))
 }
 
 #[cfg(test)]
@@ -102,6 +106,10 @@ mod tests {
             page("# A\n\n| b |\n| --- |\n| `c` |\n\n![The \"d\" of `e`](a.svg)\n", folder.path()).expect("a page");
         assert!(page.contains("<h1>A</h1>") && page.contains("<td><code>c</code></td>"));
         assert!(page.contains(&format!("aria-label=\"The &quot;d&quot; of e\">{svg}</span>")), "{page}");
+        assert!(
+            page.contains("<span class=\"caption\">The &quot;d&quot; of e.</span>")
+                && page.contains("<title>A</title>")
+        );
         assert!(!page.contains("src=") && !page.contains("href="));
         std::fs::write(folder.path().join("b.json.gz"), "gzip").expect("a writable folder");
         let page = super::page("[\"c\"](b.json.gz \"d\")", folder.path()).expect("a page");

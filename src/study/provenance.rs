@@ -55,11 +55,11 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     item("each agent is tested in at least 100 episodes", &short);
     let tuning = tables.starts()? == Starts::Development;
     let tuned = if tuning { vec!["these are development starts".into()] } else { Vec::new() };
-    item("the test's starts are not those of development or training", &tuned);
+    item("the test has starts of its own, which serve neither development nor training nor the curves", &tuned);
     item("one version of the program, with its sources committed, made all runs", &versions(&tables.runs()?));
     Ok(text
-        + "\nBy construction, intervals over several seeds resample seeds, then episodes (but where all episodes have the same outcome, the \
-           interval is Wilson's), and runs that do not reach the level count as censored.\n")
+        + "\nRuns that do not reach the level count as right-censored. What the tables cannot tell: on which starts and seeds the settings were \
+           chosen, and with how many trials for each method.\n")
 }
 
 /// A text that may be anything, as code.

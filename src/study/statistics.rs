@@ -148,12 +148,47 @@ pub fn two_level_bootstrap(tasks: &[&[Vec<f64>]], rng: &mut Rng) -> [f64; 2] {
 #[doc(alias = "Student t")]
 #[doc(alias = "confidence interval")]
 pub fn t_interval(means: &[f64]) -> Option<[f64; 2]> {
-    /// The 97.5 % quantiles for 1 to 9 degrees of freedom.
-    const QUANTILES: [f64; 9] = [12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622];
-    let quantile = QUANTILES.get(means.len().checked_sub(2)?)?;
-    // The deviation divides by n: over n - 1 roots, that is the standard error.
-    let half = quantile * deviation(means) / ((means.len() - 1) as f64).sqrt();
+    let half = t_quantile(means.len())? * squared_error(means).sqrt();
     Some([mean(means) - half, mean(means) + half])
+}
+
+/// The 95 % t interval, `[low, high]`, of the difference of two means over independent seeds, first minus second; `None` if
+/// one has fewer than two or more than ten seeds. Like [`t_interval`], safer than a bootstrap with few seeds.
+///
+/// Welch, "The generalization of 'Student's' problem", Biometrika 34 (1947). Deviation: the degrees of freedom are the smaller
+/// of the two numbers of seeds, less one, which makes the interval wider.
+#[doc(alias = "Welch t test")]
+#[doc(alias = "confidence interval")]
+pub fn welch_interval(first: &[f64], second: &[f64]) -> Option<[f64; 2]> {
+    let quantile = t_quantile(first.len())?.max(t_quantile(second.len())?);
+    let half = quantile * (squared_error(first) + squared_error(second)).sqrt();
+    let difference = mean(first) - mean(second);
+    Some([difference - half, difference + half])
+}
+
+/// The same for the ratio of two positive means, first over second: the t interval of the difference of their logarithms, whose
+/// standard errors are those of the means over the means (the delta method).
+#[doc(alias = "confidence interval")]
+#[doc(alias = "sample efficiency")]
+pub fn ratio_t_interval(first: &[f64], second: &[f64]) -> Option<[f64; 2]> {
+    let quantile = t_quantile(first.len())?.max(t_quantile(second.len())?);
+    let relative = |values: &[f64]| squared_error(values) / mean(values).powi(2);
+    let factor = (quantile * (relative(first) + relative(second)).sqrt()).exp();
+    let ratio = mean(first) / mean(second);
+    Some([ratio / factor, ratio * factor])
+}
+
+/// The 97.5 % quantile of Student's t distribution for the mean of two to ten values.
+fn t_quantile(values: usize) -> Option<f64> {
+    /// For 1 to 9 degrees of freedom.
+    const QUANTILES: [f64; 9] = [12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622];
+    QUANTILES.get(values.checked_sub(2)?).copied()
+}
+
+/// The square of the standard error of a mean.
+fn squared_error(values: &[f64]) -> f64 {
+    // The deviation divides by n: over n - 1 roots, that is the standard error.
+    deviation(values).powi(2) / (values.len() - 1) as f64
 }
 
 /// The difference of the means of two methods that met the same starts, first minus second, and its 95 % interval by the

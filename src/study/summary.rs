@@ -4,7 +4,8 @@ use polars::prelude::*;
 
 use super::statistics::{
     IQM_RUNS, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
-    probability_of_improvement, ratio_of_means, restricted_mean, steps_to, t_interval, two_level_bootstrap, wilson,
+    probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean, steps_to, t_interval,
+    two_level_bootstrap, welch_interval, wilson,
 };
 use super::tables::{BASELINE, Curve, LEVEL, by_run, curves, lists, of, optional_curves, strings};
 use crate::rng::{self, Rng};
@@ -77,7 +78,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
 }
 
 /// The columns after task and method. Scripts read them by name: new ones are added at the end, none is removed.
-const SUMMARY: [&str; 38] = [
+const SUMMARY: [&str; 44] = [
     "seeds",
     "steps",
     "test_episodes",
@@ -116,6 +117,12 @@ const SUMMARY: [&str; 38] = [
     "earlier_than_sac",
     "earlier_than_sac_low",
     "earlier_than_sac_high",
+    "area_under_curve_t_low",
+    "area_under_curve_t_high",
+    "success_minus_sac_t_low",
+    "success_minus_sac_t_high",
+    "sac_steps_ratio_t_low",
+    "sac_steps_ratio_t_high",
 ];
 
 /// The stream of every bootstrap: the tables alone decide its result.
@@ -178,7 +185,9 @@ impl Runs {
             if !self.clocks.is_empty() {
                 row.push(("seconds_to_80", censored_median(&self.seconds())));
             }
-            row.push(("action_ms", Some(mean(&last_of_each(&self.action_ms)))));
+            // The median: a seed that ran beside other programs does not count for more.
+            let action_ms: Vec<Option<f64>> = last_of_each(&self.action_ms).into_iter().map(Some).collect();
+            row.push(("action_ms", censored_median(&action_ms)));
             row.push(("updates", Some(mean(&last_of_each(&self.updates)))));
             let [expected, realised, correlation] =
                 self.expectations.each_ref().map(|curves| mean(&last_of_each(curves)));
@@ -192,6 +201,10 @@ impl Runs {
                 ("area_under_curve", Some(mean(&areas))),
                 ("common_budget", Some(common)),
             ]);
+            if let Some([low, high]) = t_interval(&areas) {
+                let [low, high] = [low, high].map(|end| Some(end.clamp(0.0, 1.0)));
+                row.extend([("area_under_curve_t_low", low), ("area_under_curve_t_high", high)]);
+            }
             let is_baseline = |other: &&Self| other.task == self.task && other.method == BASELINE && other.learns();
             if let Some(baseline) = all.iter().find(is_baseline).filter(|_| self.method != BASELINE) {
                 row.extend(self.against(baseline));
@@ -213,6 +226,10 @@ impl Runs {
             ("success_minus_sac_low", Some(low)),
             ("success_minus_sac_high", Some(high)),
         ];
+        if let Some([low, high]) = welch_interval(&self.by_seed(), &baseline.by_seed()) {
+            let [low, high] = [low, high].map(|end| Some(end.clamp(-1.0, 1.0)));
+            row.extend([("success_minus_sac_t_low", low), ("success_minus_sac_t_high", high)]);
+        }
         // A censored run is later than any other.
         let sooner = |runs: &Self| runs.times().iter().map(|time| -time.unwrap_or(f64::INFINITY)).collect::<Vec<f64>>();
         for (entries, first, second) in [
@@ -235,6 +252,9 @@ impl Runs {
             let (ratio, [low, high]) = ratio_of_means(&longer, &times, &mut stream());
             let entries = ["sac_steps_ratio", "sac_steps_ratio_low", "sac_steps_ratio_high"];
             row.extend(entries.into_iter().zip([Some(ratio), Some(low), known.then_some(high)]));
+            if let Some([low, high]) = ratio_t_interval(&longer, &times) {
+                row.extend([("sac_steps_ratio_t_low", Some(low)), ("sac_steps_ratio_t_high", known.then_some(high))]);
+            }
         }
         row
     }

@@ -3,6 +3,9 @@
 use super::tables::{BASELINE, LEVEL, Tables};
 use crate::error::Result;
 
+/// The methods of this crate that plan with the reward as a function; the others have only the rewards that they receive.
+pub(super) const TOLD_THE_REWARD: [&str; 2] = ["oracle", "pets"];
+
 /// For each task, which methods are better than the baseline and which are not, as far as intervals tell.
 ///
 /// # Errors
@@ -16,54 +19,78 @@ pub(super) fn verdict(tables: &Tables, tasks: &[&str]) -> Result<String> {
 }
 
 fn on_task(tables: &Tables, task: &str) -> Result<String> {
+    let methods = tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task).map(|(_, method)| method);
+    let methods: Vec<String> = methods.collect();
     let mut learning = Vec::new();
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
-        if tables.value(task, &method, "steps")?.is_some() {
-            learning.push(method);
+    for method in &methods {
+        if tables.value(task, method, "steps")?.is_some() {
+            learning.push(method.as_str());
         }
     }
     if learning.is_empty() {
         return Ok(String::new());
     }
+    let mut points = vec![first_at_the_level(tables, task, &learning)?];
+    if learning.contains(&BASELINE) {
+        points.extend(beside_the_baseline(tables, task, &learning)?);
+    }
+    points.extend(smoothness(tables, task, &methods)?);
+    let points: Vec<String> = points.iter().map(|point| format!("  - {point}\n")).collect();
+    Ok(format!("- **{task}**\n{}", points.concat()))
+}
+
+/// Which method reaches the level first, and which of those that are not told the reward.
+fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<String> {
+    let mut medians: Vec<(f64, &str)> = Vec::new();
+    for method in learning {
+        medians.extend(tables.value(task, method, "steps_to_80")?.map(|steps| (steps, *method)));
+    }
+    medians.sort_by(|a, b| a.0.total_cmp(&b.0));
     let level = 100.0 * LEVEL;
-    let mut soonest: Option<(f64, &str)> = None;
-    for method in &learning {
-        if let Some(steps) = tables.value(task, method, "steps_to_80")?
-            && soonest.is_none_or(|(least, _)| steps < least)
-        {
-            soonest = Some((steps, method));
-        }
-    }
-    let mut text = match soonest {
-        Some((steps, method)) => {
-            format!("- **{task}**: `{method}` is first at {level:.0} % success, by step {steps:.0}.")
-        }
-        None => format!("- **{task}**: no method reaches {level:.0} % success in its median seed."),
+    let Some((steps, first)) = medians.first() else {
+        return Ok(format!("no method reaches {level:.0} % success in its median seed."));
     };
-    if !learning.iter().any(|method| method == BASELINE) {
-        return Ok(text + "\n");
+    let told = |method: &&str| TOLD_THE_REWARD.contains(method);
+    let mut text = format!("`{first}` is first at {level:.0} % success, by step {steps:.0} (median).");
+    if told(first) {
+        text += &format!(" `{first}` is told the reward function;");
+        text += &match medians.iter().find(|(_, method)| !told(method)) {
+            Some((steps, method)) => format!(" of the methods that are not, `{method}` is first, by step {steps:.0}."),
+            None => " no method that is not gets there in its median seed.".into(),
+        };
     }
+    Ok(text)
+}
+
+/// How the other methods compare with the baseline. An interval is the wider of the bootstrap's and Student's at either end.
+fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result<Vec<String>> {
+    let mut points = Vec::new();
+    let level = 100.0 * LEVEL;
     for (column, none, better, worse, open) in [
         (
             "sac_steps_ratio",
             1.0,
-            "Fewer steps to it than",
-            "More steps to it than",
-            "No certain difference in steps to it from",
+            format!("Significantly fewer steps to {level:.0} % than"),
+            format!("Significantly more steps to {level:.0} % than"),
+            format!("No significant difference in steps to {level:.0} % from"),
         ),
         (
             "success_minus_sac",
             0.0,
-            "Higher final success than",
-            "Lower final success than",
-            "No certain difference in final success from",
+            "Significantly more success in the test than".into(),
+            "Significantly less success in the test than".into(),
+            "No significant difference in the test from".into(),
         ),
     ] {
-        let ends = [format!("{column}_low"), format!("{column}_high")];
-        let unknown = "Seeds that never get there, so no ratio to";
+        let unknown = "Not every seed gets there within the budget, so no ratio to".to_string();
         let mut groups = [better, worse, open, unknown].map(|what| (what, Vec::new()));
-        for method in learning.iter().filter(|method| *method != BASELINE) {
-            let group = match (tables.value(task, method, &ends[0])?, tables.value(task, method, &ends[1])?) {
+        for method in learning.iter().filter(|method| **method != BASELINE) {
+            let end = |which: &str, of: fn(f64, f64) -> f64| -> Result<Option<f64>> {
+                let bootstrap = tables.value(task, method, &format!("{column}_{which}"))?;
+                let student = tables.value(task, method, &format!("{column}_t_{which}"))?;
+                Ok(bootstrap.map(|end| student.map_or(end, |other| of(end, other))))
+            };
+            let group = match (end("low", f64::min)?, end("high", f64::max)?) {
                 (Some(low), _) if low > none => 0,
                 (_, Some(high)) if high < none => 1,
                 (None, None) => 3,
@@ -71,9 +98,26 @@ fn on_task(tables: &Tables, task: &str) -> Result<String> {
             };
             groups[group].1.push(format!("`{method}`"));
         }
-        for (what, methods) in groups.into_iter().filter(|(_, methods)| !methods.is_empty()) {
-            text += &format!(" {what} `{BASELINE}`: {}.", methods.join(", "));
+        let found = groups.into_iter().filter(|(_, methods)| !methods.is_empty());
+        let sentences: Vec<String> =
+            found.map(|(what, methods)| format!("{what} `{BASELINE}`: {}.", methods.join(", "))).collect();
+        if !sentences.is_empty() {
+            points.push(sentences.join(" "));
         }
     }
-    Ok(text + "\n")
+    Ok(points)
+}
+
+/// The methods in the order of their smoothness.
+fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<String>> {
+    let mut known: Vec<(f64, &str)> = Vec::new();
+    for method in methods {
+        known.extend(tables.value(task, method, "smoothness_sparc")?.map(|sparc| (sparc, method.as_str())));
+    }
+    if known.len() < 2 {
+        return Ok(None);
+    }
+    known.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let known: Vec<String> = known.iter().map(|(sparc, method)| format!("`{method}` {sparc:.1}")).collect();
+    Ok(Some(format!("SPARC, from the smoothest hand to the jerkiest: {}.", known.join(", "))))
 }

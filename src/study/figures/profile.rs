@@ -19,7 +19,7 @@ const THRESHOLDS: usize = 100;
 pub fn profile(tables: &Tables, task: &str, path: &Path) -> Result<bool> {
     let thresholds: Vec<f64> = (0..THRESHOLDS).map(|i| i as f64 / THRESHOLDS as f64).collect();
     let mut profile = Chart::new("success rate in the test", "")
-        .titled("share of seeds above it")
+        .titled("share of seeds above a success rate")
         .x_between(0.0, 1.0)
         .x_ticks(6, percent)
         .between(-0.02, 1.04)

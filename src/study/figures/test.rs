@@ -1,18 +1,21 @@
 use std::path::Path;
 
-use super::{Tables, methods, percent, save, tenths};
+use super::{Tables, mean, methods, percent, save, tenths};
 use crate::chart::{Chart, Panels};
 use crate::error::Result;
 
-/// The final test of every method on one task: success rate with its 95 % interval from the summary, and smoothness of the
-/// hand if there is one.
+/// How far below a method's interval its seeds are drawn, in rows.
+const BELOW: f64 = 0.25;
+
+/// The final test of every method on one task: the success rate of each seed (small dots, below), their mean with its 95 %
+/// interval from the summary, and smoothness of the hand if there is one.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
 pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
     let methods = methods(tables, task)?;
     let mut success = Chart::new("", "")
-        .titled("success rate, 95 % interval")
+        .titled("success rate: seeds, mean, 95 % interval")
         .x_between(-0.03, 1.03)
         .x_ticks(6, percent)
         .rows(methods.iter().map(|(_, method)| method));
@@ -25,6 +28,9 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         let interval = low.into_iter().chain(high).map(|end| (end, y));
         success = success.line("", interval).coloured(*colour);
         success = success.dots("", middle.map(|x| (x, y))).coloured(*colour);
+        let seeds = tables.successes(task, method)?;
+        let rates = seeds.iter().map(|episodes| (mean(episodes), y + BELOW));
+        success = success.points("", rates.filter(|_| seeds.len() > 1)).coloured(*colour);
         if let Some(sparc) = value("smoothness_sparc")? {
             smoothness = smoothness.dots("", [(sparc, y)]).coloured(*colour);
             roughest = roughest.min(sparc);

@@ -1,0 +1,118 @@
+//! The report of a study, written from its tables alone.
+
+mod results;
+mod task;
+
+use std::path::Path;
+use std::time::Duration;
+
+use super::page;
+use super::provenance;
+use super::replays;
+use super::starts::Starts;
+use super::tables::Tables;
+use super::verdict::{TOLD_THE_REWARD, verdict};
+use crate::error::Result;
+use crate::files;
+
+/// A temporary file that is older than this is nobody's any more.
+const ABANDONED: Duration = Duration::from_secs(3600);
+
+/// Reads a study's tables from the folder `from`, and writes `summary.csv`, the figures, `report.md` and the same as a
+/// page that needs no other file, `report.html`, into the folder `to`. Returns the table of results as text.
+///
+/// # Errors
+/// If a table is missing or damaged, or if a file cannot be written.
+pub fn write(from: &Path, to: &Path) -> Result<String> {
+    let tables = Tables::read(from)?;
+    files::sweep(to, ABANDONED);
+    tables.write_summary(to)?;
+    let pairs = tables.tasks_and_methods()?;
+    let mut tasks: Vec<&str> = Vec::new();
+    for (task, _) in &pairs {
+        if !tasks.contains(&task.as_str()) {
+            tasks.push(task);
+        }
+    }
+    let mut text = format!("# Comparison on {}\n\n", tasks.join(", "));
+    text += tuning_note(&tables)?;
+    let verdict = verdict(&tables, &tasks)?;
+    if !verdict.is_empty() {
+        text += &format!("## Verdict\n\n{verdict}\n");
+    }
+    text += &format!("## What is compared\n\n{}\n", terms(&pairs));
+    text += &format!("## Results\n\n{}", results::section(&tables)?);
+    let replays = replays::read(from)?;
+    replays::copy(&replays, from, to)?;
+    let mut not_alike = Vec::new();
+    for name in &tasks {
+        text += &task::section(&tables, name, &replays, to)?;
+        if task::grids_differ(&tables, name)? {
+            not_alike.push(*name);
+        }
+    }
+    text += &format!("\n## How certain is this?\n\n{}", caveat(&tables, &pairs)?);
+    text += &format!("\n## Checklist\n\n{}", provenance::checklist(&tables, &not_alike)?);
+    let configurations = provenance::configurations(&tables)?;
+    if !configurations.is_empty() {
+        text += &format!("\n## Configurations\n{configurations}");
+    }
+    files::write(&to.join("report.md"), text.as_bytes())?;
+    files::write(&to.join("report.html"), page::page(&text, to)?.as_bytes())?;
+    Ok(tuning_note(&tables)?.to_string() + &results::text_table(&tables)?)
+}
+
+/// What stands above the numbers of runs that served to choose settings.
+fn tuning_note(tables: &Tables) -> Result<&'static str> {
+    Ok(match tables.starts()? {
+        Starts::Test => "",
+        Starts::Development => {
+            "Tuning runs: everything here was measured on development starts. Choose settings by it, but report the results \
+             of runs on the test's starts.\n\n"
+        }
+    })
+}
+
+/// What all methods have in common, and what some know that the others do not.
+fn terms(pairs: &[(String, String)]) -> String {
+    let mut told: Vec<String> = pairs.iter().map(|(_, method)| format!("`{method}`")).collect();
+    told.retain(|method| TOLD_THE_REWARD.contains(&method.trim_matches('`')));
+    told.sort();
+    told.dedup();
+    let mut text = String::from(
+        "All methods have the same tasks, observations and initial states. They are evaluated without exploration noise (planners still \
+         sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \
+         `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` in the same folder; settings are listed at the end.\n",
+    );
+    if !told.is_empty() {
+        text += &format!(
+            "\nThe methods do not have the same information: {} plan{} with the reward as a function{}. The other learning methods have \
+             only the rewards that they receive.\n",
+            told.join(" and "),
+            if told.len() == 1 { "s" } else { "" },
+            if told.iter().any(|method| method == "`oracle`") { ", `oracle` in the true simulator" } else { "" },
+        );
+    }
+    text
+}
+
+fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
+    let mut fewest = f64::INFINITY;
+    for (task, method) in pairs {
+        if tables.value(task, method, "steps")?.is_some() {
+            fewest = fewest.min(tables.value(task, method, "seeds")?.unwrap_or(0.0));
+        }
+    }
+    Ok(match fewest {
+        f64::INFINITY => "No method here learns, so the only uncertainty is that of the test episodes.\n".into(),
+        n if n < 5.0 => format!(
+            "Not very: a learning method has only {n:.0} seed{} here, too few for an interval over seeds to be trusted. Run \
+             `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
+            if n == 1.0 { "" } else { "s" }
+        ),
+        n => format!(
+            "Each learning method has at least {n:.0} seeds. With five, a bootstrap interval that should cover the truth in 95 % \
+             of cases covers it in about 90; the t interval over seeds is the safer one.\n"
+        ),
+    })
+}

@@ -1,0 +1,237 @@
+//! What a report says about one task.
+
+use std::path::Path;
+
+use super::super::figures;
+use super::super::replays::{self, Replay};
+use super::super::tables::{BASELINE, Curve, LEVEL, Tables};
+use crate::error::Result;
+
+/// The findings, tables and figures of a task. The figures are written into the folder `to`.
+///
+/// # Errors
+/// If the tables lack a column or a file cannot be written.
+pub(super) fn section(tables: &Tables, task: &str, replays: &[Replay], to: &Path) -> Result<String> {
+    let mut text = format!("\n## {task}\n\n{}{}", findings(tables, task)?, evaluations(tables, task)?);
+    text += &details(tables, task)?;
+    let mut figure = |file: String, caption: &str| text += &format!("\n![{caption}]({file})\n");
+    let file = format!("{task}-learning.svg");
+    if figures::learning_curves(tables, task, &to.join(&file))? {
+        let caption = "Success rate over environment steps, a panel for each method: thin lines are seeds, the thick line is their mean; \
+                       grey lines are the means of the other methods";
+        figure(file, caption);
+    }
+    let file = format!("{task}-profile.svg");
+    if figures::profile(tables, task, &to.join(&file))? {
+        let caption = "Performance profile (the share of seeds whose success rate in the test exceeds a threshold), and the success rate of each seed \
+                       over the seconds of its run";
+        figure(file, caption);
+    }
+    let file = format!("{task}-test.svg");
+    figures::tests(tables, task, &to.join(&file))?;
+    figure(
+        file,
+        "The test: success rate of each seed (small dots), their mean with its 95 % interval, and smoothness of the hand",
+    );
+    text += &replays::table(replays, task);
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        text += &diagnostics(tables, task, &method, to)?;
+    }
+    Ok(text)
+}
+
+/// The figures about a method's model and values, folded, where a page can.
+fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<String> {
+    let mut text = String::new();
+    let stem = figures::stem(task, method);
+    let file = format!("{stem}-model.svg");
+    if figures::model(tables, task, method, &to.join(&file))? {
+        text += &format!("![Open-loop prediction error and calibration of the model of {method}]({file})\n\n");
+    }
+    let file = format!("{stem}-values.svg");
+    if figures::values(tables, task, method, &to.join(&file))? {
+        text += &format!("![Return that {method} expected, and the return that followed]({file})\n\n");
+    }
+    let left_out = tables.left_out(task, method)?;
+    if left_out > 0 {
+        text += &format!("Not drawn, because not finite: {left_out} of the numbers about `{method}`.\n\n");
+    }
+    if text.is_empty() {
+        return Ok(text);
+    }
+    Ok(format!("\n<details><summary>Model and values of <code>{method}</code></summary>\n\n{text}</details>\n"))
+}
+
+/// The results of a task in words.
+fn findings(tables: &Tables, task: &str) -> Result<String> {
+    let mut text = String::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        let value = |column: &str| tables.value(task, &method, column);
+        let (success, level) = (100.0 * value("success")?.unwrap_or(0.0), 100.0 * LEVEL);
+        let (Some(budget), Some(reaching), Some(seeds)) =
+            (value("steps")?, value("seeds_reaching_80")?, value("seeds")?)
+        else {
+            text += &format!("- `{method}` does not learn; it succeeds in {success:.0} % of the test episodes.\n");
+            continue;
+        };
+        text += &match value("steps_to_80")? {
+            Some(steps) => format!(
+                "- `{method}` reaches {level:.0} % success by step {steps:.0} (median; {reaching:.0} of {seeds:.0} seeds \
+                 reach it within {budget:.0}) and ends at {success:.0} %"
+            ),
+            None => format!(
+                "- `{method}` does not reach {level:.0} % success in its median seed within {budget:.0} steps \
+                 ({reaching:.0} of {seeds:.0} seeds do); it ends at {success:.0} %"
+            ),
+        };
+        text += &match (value("success_t_low")?, value("success_t_high")?) {
+            (Some(low), Some(high)) => {
+                format!(" (t interval over its {seeds:.0} seeds: [{:.0}, {:.0}]).", 100.0 * low, 100.0 * high)
+            }
+            _ if seeds < 2.0 => {
+                " (one seed: the interval covers its test episodes, not what another seed would bring).".into()
+            }
+            _ => ".".into(),
+        };
+        text += &against_the_baseline(tables, task, &method)?;
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+/// The numbers of the methods that learn a task which the first table has no room for.
+fn details(tables: &Tables, task: &str) -> Result<String> {
+    let mut rows = String::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        let value = |column: &str| tables.value(task, &method, column);
+        if value("steps")?.is_none() {
+            continue;
+        }
+        let show = |column: &str, text: fn(f64) -> String| value(column).map(|found| found.map_or("-".into(), text));
+        let beside = |column: &str| -> Result<String> {
+            let [low, high] = [value(&format!("{column}_low"))?, value(&format!("{column}_high"))?];
+            Ok(match (value(column)?, low, high) {
+                (Some(p), Some(low), Some(high)) => format!("{p:.2} [{low:.2}, {high:.2}]"),
+                _ => "-".into(),
+            })
+        };
+        let [low, high] = [value("area_under_curve_t_low")?, value("area_under_curve_t_high")?];
+        let area = match (value("area_under_curve")?, low, high) {
+            (Some(area), Some(low), Some(high)) => format!("{area:.2} [{low:.2}, {high:.2}]"),
+            (Some(area), ..) => format!("{area:.2}"),
+            _ => "-".into(),
+        };
+        rows += &format!(
+            "| {method} | {} | {} | {} | {} | {} | {} | {} |\n",
+            area,
+            show("updates", |updates| format!("{updates:.0}"))?,
+            show("action_change", |change| format!("{change:.2}"))?,
+            show("optimism", |share| format!("{:+.0} %", (100.0 * share).round() + 0.0))?,
+            show("return_correlation", |correlation| format!("{correlation:.2}"))?,
+            beside("improvement_over_sac")?,
+            beside("earlier_than_sac")?,
+        );
+    }
+    if rows.is_empty() {
+        return Ok(rows);
+    }
+    Ok(format!(
+        "\n| method | area under the curve | gradient updates | action change | optimism | correlation | better than `{BASELINE}` | earlier than `{BASELINE}` |\n\
+         |{}\n{rows}",
+        " --- |".repeat(8)
+    ))
+}
+
+/// The comparison of a method with [`BASELINE`], if both learn the task.
+fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<String> {
+    let value = |column: &str| tables.value(task, method, column);
+    let ends =
+        |column: &str| -> Result<_> { Ok((value(&format!("{column}_low"))?, value(&format!("{column}_high"))?)) };
+    let (Some(difference), (Some(low), Some(high))) = (value("success_minus_sac")?, ends("success_minus_sac")?) else {
+        return Ok(String::new());
+    };
+    let mut text = if low < high {
+        let [difference, low, high] = [difference, low, high].map(|share| 100.0 * share);
+        format!(
+            " Success from the same test starts, minus that of `{BASELINE}`: {difference:+.0} percentage points [{low:+.0}, {high:+.0}]{}.",
+            match ends("success_minus_sac_t")? {
+                (Some(low), Some(high)) => format!(", t interval [{:+.0}, {:+.0}]", 100.0 * low, 100.0 * high),
+                _ => String::new(),
+            }
+        )
+    } else {
+        format!(" From the same test starts, its episodes and those of `{BASELINE}` show no spread to compare.")
+    };
+    let level = 100.0 * LEVEL;
+    match (value("sac_steps_ratio")?, ends("sac_steps_ratio")?) {
+        (Some(ratio), (Some(low), Some(high))) => {
+            text += &format!(
+                " To {level:.0} % success `{BASELINE}` takes {ratio:.1} times as many steps [{low:.1}, {high:.1}]{}.",
+                match ends("sac_steps_ratio_t")? {
+                    (Some(low), Some(high)) => format!(", t interval [{low:.1}, {high:.1}]"),
+                    _ => String::new(),
+                }
+            );
+        }
+        (Some(ratio), (Some(low), None)) => {
+            text += &format!(
+                " To {level:.0} % success `{BASELINE}` takes at least {ratio:.1} times as many steps (its censored seeds \
+                 count as its budget; 95 % interval from {low:.1}{}).",
+                ends("sac_steps_ratio_t")?.0.map_or(String::new(), |low| format!(", t interval from {low:.1}"))
+            );
+        }
+        _ => {}
+    }
+    Ok(text)
+}
+
+/// How often the methods that learn a task were evaluated; a warning if not all alike.
+fn evaluations(tables: &Tables, task: &str) -> Result<String> {
+    let grids = grids(tables, task)?;
+    let one = |seeds: &[Curve]| {
+        let (steps, episodes) = &seeds[0];
+        let every = steps.get(1).unwrap_or(&0.0) - steps[0];
+        format!("every {every:.0} steps with {:.0} episodes", episodes[0])
+    };
+    let Some((_, first)) = grids.first() else { return Ok(String::new()) };
+    if !grids_differ(tables, task)? {
+        return Ok(format!(
+            "\nEvaluations: {}. A step by which {:.0} % success is reached is late by up to the distance of two.\n",
+            one(first),
+            100.0 * LEVEL
+        ));
+    }
+    let each: Vec<String> = grids.iter().map(|(method, seeds)| format!("`{method}` {}", one(seeds))).collect();
+    Ok(format!(
+        "\n**Not evaluated alike:** {}. A coarser grid reports a later step, and fewer episodes a noisier one.\n",
+        each.join(", ")
+    ))
+}
+
+/// Whether the methods that learn a task were not all evaluated at the same steps with the same number of episodes.
+///
+/// # Errors
+/// If the evaluations lack a column.
+pub(super) fn grids_differ(tables: &Tables, task: &str) -> Result<bool> {
+    let grids = grids(tables, task)?;
+    let mut seeds = grids.iter().flat_map(|(_, seeds)| seeds);
+    let Some(common) = seeds.clone().filter_map(|(steps, _)| steps.last().copied()).reduce(f64::min) else {
+        return Ok(false);
+    };
+    // Budgets may differ: what counts is the part that all have in common.
+    let until = |(steps, episodes): &Curve| -> Vec<(f64, f64)> {
+        steps.iter().copied().zip(episodes.iter().copied()).take_while(|(step, _)| *step <= common).collect()
+    };
+    let first = seeds.next().map(until);
+    Ok(!seeds.all(|seed| Some(until(seed)) == first))
+}
+
+/// Of each method that learns a task, the steps and numbers of episodes of each seed's evaluations.
+fn grids(tables: &Tables, task: &str) -> Result<Vec<(String, Vec<Curve>)>> {
+    let mut grids: Vec<(String, Vec<Curve>)> = Vec::new();
+    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        grids.push((method.clone(), tables.evaluation_grid(task, &method)?));
+    }
+    grids.retain(|(_, seeds)| !seeds.is_empty());
+    Ok(grids)
+}
