@@ -1,6 +1,5 @@
 use std::path::Path;
 
-use plotters::chart::SeriesLabelPosition;
 use plotters::style::RGBColor;
 
 use super::{Band, Tables, band, means, percent, save, tenths, thousands};
@@ -31,12 +30,15 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
     if errors.is_empty() {
         return Ok(false);
     }
-    let worst = errors.iter().flat_map(|(.., band)| band).map(|(_, [.., high])| *high).fold(1.05, f64::max);
+    // The mean over seeds is drawn. A model that has learned nothing yet may be off by any factor: a logarithmic axis shows it.
+    let drawn: Vec<f64> = errors.iter().flat_map(|(.., band)| means(band)).map(|(_, error)| error).collect();
+    let least = drawn.iter().copied().filter(|error| *error > 0.0).fold(1.0, f64::min);
+    let worst = drawn.iter().copied().fold(1.0, f64::max);
     let error = over_training("open-loop prediction error (1: predicting no change)", &errors)
-        .between(0.0, worst.min(4.0))
-        .y_ticks(11, tenths)
-        .mark(1.0)
-        .legend(SeriesLabelPosition::UpperRight);
+        .log_y()
+        .between(0.8 * least, 1.25 * worst)
+        .y_ticks(6, short)
+        .mark(1.0);
     let title = format!("{task}: open-loop predictions of {method} on held-out episodes");
     let mut panels = Panels::new(&title).panel(error);
     if !coverages.is_empty() {
@@ -82,14 +84,16 @@ pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<
 fn over_training(title: &str, lines: &[(RGBColor, String, Band)]) -> Chart {
     let steps = lines.iter().flat_map(|(.., band)| band).map(|(x, _)| *x);
     let (first, last) = (steps.clone().fold(f64::INFINITY, f64::min), steps.fold(0.0, f64::max));
-    let chart = Chart::new("environment steps", "")
-        .titled(title)
-        .x_between(first.min(last - 1.0), last)
-        .x_ticks(5, thousands)
-        .legend(SeriesLabelPosition::LowerRight);
+    let chart =
+        Chart::new("environment steps", "").titled(title).x_between(first.min(last - 1.0), last).x_ticks(5, thousands);
     lines.iter().fold(chart, |chart, (colour, label, band)| chart.line(label, means(band)).coloured(*colour))
 }
 
 fn whole(y: f64) -> String {
     format!("{y:.0}")
+}
+
+/// Without trailing zeros: "0.05", "2".
+fn short(y: f64) -> String {
+    format!("{}", (100.0 * y).round() / 100.0)
 }
