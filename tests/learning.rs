@@ -556,9 +556,9 @@ fn renamed_keys_are_understood() {
     open(&config, &run).expect("the same run");
 }
 
-/// The agents that ship with the repository: of other starts than those of their test, they reach most goals.
+/// The agents that ship with the repository succeed from most of other starts than those of their test.
 #[test]
-fn trained_agents_that_ship_still_reach() {
+fn trained_agents_that_ship_still_succeed() {
     let registry = Registry::standard();
     let mut agents = 0;
     for folder in std::fs::read_dir("data/trained").expect("a folder") {
@@ -569,5 +569,5 @@ fn trained_agents_that_ship_still_reach() {
         assert!(summary.success >= 0.7, "{}: {}", folder.display(), summary.success);
         agents += 1;
     }
-    assert_eq!(agents, 4);
+    assert_eq!(agents, 7);
 }

@@ -128,27 +128,19 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("pets", column));
     quotes.push(("README.md", format!("SAC takes at least {ratio:.1} times as many (95 % interval from {low:.1})")));
     quotes.push(("chapters/00-start.md", format!("needs at least {ratio:.1} times as many")));
-    let lift = |method: &str, column: &str| in_study("lift-pets-sac", "lift", method, column);
-    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| lift("pets", column));
-    quotes.push((
-        "README.md",
-        format!("SAC takes at least {ratio:.1} times as many steps (interval from {low:.1}), and one of its seeds"),
-    ));
-    quotes.push((
-        "README.md",
-        format!("PETS lifts in {} of the test episodes", success("lift-pets-sac", "lift", "pets")),
-    ));
-    assert_eq!([lift("pets", "steps_to_80"), lift("pets", "seeds_reaching_80")], [10_000.0, 5.0]);
-    let lift = |column: &str| in_study("lift-tdmpc2-sac", "lift", "tdmpc2", column);
-    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(lift);
-    let tested = success("lift-tdmpc2-sac", "lift", "tdmpc2");
-    quotes.push((
-        "README.md",
-        format!(
-            "{ratio:.1} times as many (interval from {low:.1}), and TD-MPC2 lifts in {tested} of the test episodes"
-        ),
-    ));
-    assert_eq!([lift("steps_to_80"), lift("seeds_reaching_80")], [8000.0, 5.0]);
+    let lift = |method: &str, column: &str| in_study("lift", "lift", method, column);
+    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_t_low"].map(|column| lift("pets", column));
+    let [pets, tdmpc2, sac] = ["pets", "tdmpc2", "sac"].map(|method| success("lift", "lift", method));
+    let by = |method: &str| thousands(lift(method, "steps_to_80"));
+    quotes.extend([
+        ("README.md", format!("it is at 80 % by step {} in the median, with all five seeds", by("pets"))),
+        ("README.md", format!("SAC takes at least {ratio:.1} times as many (t interval from {low:.1}), and two of its")),
+        ("README.md", format!("TD-MPC2 is at 80 % by step {} in the median, with four", by("tdmpc2"))),
+        ("README.md", format!("and SAC by {}, with three", by("sac"))),
+        ("README.md", format!("PETS lifts in {pets} of the episodes, TD-MPC2 in {tdmpc2}, and SAC in {sac}")),
+        ("README.md", format!("PETS lifts in {pets} of the test episodes")),
+    ]);
+    assert_eq!(["pets", "tdmpc2", "sac"].map(|method| lift(method, "seeds_reaching_80")), [5.0, 4.0, 3.0]);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("tdmpc2", column));
     quotes.push(("README.md", format!("(SAC takes at least {ratio:.1} times as many, interval from {low:.1})")));
     let tdmpc2 = format!("SAC takes at least {ratio:.1} times as many steps (95 % interval from {low:.1};");
