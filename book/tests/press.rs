@@ -134,7 +134,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let by = |method: &str| thousands(lift(method, "steps_to_80"));
     quotes.extend([
         ("README.md", format!("it is at 80 % by step {} in the median, with all five seeds", by("pets"))),
-        ("README.md", format!("SAC takes at least {ratio:.1} times as many (t interval from {low:.1}), and two of its")),
+        (
+            "README.md",
+            format!("SAC takes at least {ratio:.1} times as many (t interval from {low:.1}), and two of its"),
+        ),
         ("README.md", format!("TD-MPC2 is at 80 % by step {} in the median, with four", by("tdmpc2"))),
         ("README.md", format!("and SAC by {}, with three", by("sac"))),
         ("README.md", format!("PETS lifts in {pets} of the episodes, TD-MPC2 in {tdmpc2}, and SAC in {sac}")),
