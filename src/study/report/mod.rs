@@ -46,8 +46,9 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     replays::copy(&replays, from, to)?;
     let mut not_alike = Vec::new();
     for name in &tasks {
-        text += &task::section(&tables, name, &replays, to)?;
-        if task::grids_differ(&tables, name)? {
+        let differ = task::grids_differ(&tables, name)?;
+        text += &task::section(&tables, name, differ, &replays, to)?;
+        if differ {
             not_alike.push(*name);
         }
     }
@@ -75,10 +76,8 @@ fn tuning_note(tables: &Tables) -> Result<&'static str> {
 
 /// What all methods have in common, and what some know that the others do not.
 fn terms(pairs: &[(String, String)]) -> String {
-    let mut told: Vec<String> = pairs.iter().map(|(_, method)| format!("`{method}`")).collect();
-    told.retain(|method| TOLD_THE_REWARD.contains(&method.trim_matches('`')));
-    told.sort();
-    told.dedup();
+    let told = TOLD_THE_REWARD.into_iter().filter(|told| pairs.iter().any(|(_, method)| method == told));
+    let told: Vec<String> = told.map(|method| format!("`{method}`")).collect();
     let mut text = String::from(
         "All methods have the same tasks, observations and initial states. They are evaluated without exploration noise (planners still \
          sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \

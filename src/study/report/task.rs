@@ -7,12 +7,13 @@ use super::super::replays::{self, Replay};
 use super::super::tables::{BASELINE, Curve, LEVEL, Tables};
 use crate::error::Result;
 
-/// The findings, tables and figures of a task. The figures are written into the folder `to`.
+/// The findings, tables and figures of a task, whose methods may have been evaluated on grids that differ. The figures are
+/// written into the folder `to`.
 ///
 /// # Errors
 /// If the tables lack a column or a file cannot be written.
-pub(super) fn section(tables: &Tables, task: &str, replays: &[Replay], to: &Path) -> Result<String> {
-    let mut text = format!("\n## {task}\n\n{}{}", findings(tables, task)?, evaluations(tables, task)?);
+pub(super) fn section(tables: &Tables, task: &str, differ: bool, replays: &[Replay], to: &Path) -> Result<String> {
+    let mut text = format!("\n## {task}\n\n{}{}", findings(tables, task)?, evaluations(tables, task, differ)?);
     text += &details(tables, task)?;
     let mut figure = |file: String, caption: &str| text += &format!("\n![{caption}]({file})\n");
     let file = format!("{task}-learning.svg");
@@ -108,28 +109,23 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
             continue;
         }
         let show = |column: &str, text: fn(f64) -> String| value(column).map(|found| found.map_or("-".into(), text));
-        let beside = |column: &str| -> Result<String> {
-            let [low, high] = [value(&format!("{column}_low"))?, value(&format!("{column}_high"))?];
+        let interval = |column: &str, kind: &str| -> Result<String> {
+            let [low, high] = [value(&format!("{column}{kind}_low"))?, value(&format!("{column}{kind}_high"))?];
             Ok(match (value(column)?, low, high) {
-                (Some(p), Some(low), Some(high)) => format!("{p:.2} [{low:.2}, {high:.2}]"),
+                (Some(x), Some(low), Some(high)) => format!("{x:.2} [{low:.2}, {high:.2}]"),
+                (Some(x), ..) => format!("{x:.2}"),
                 _ => "-".into(),
             })
         };
-        let [low, high] = [value("area_under_curve_t_low")?, value("area_under_curve_t_high")?];
-        let area = match (value("area_under_curve")?, low, high) {
-            (Some(area), Some(low), Some(high)) => format!("{area:.2} [{low:.2}, {high:.2}]"),
-            (Some(area), ..) => format!("{area:.2}"),
-            _ => "-".into(),
-        };
         rows += &format!(
             "| {method} | {} | {} | {} | {} | {} | {} | {} |\n",
-            area,
+            interval("area_under_curve", "_t")?,
             show("updates", |updates| format!("{updates:.0}"))?,
             show("action_change", |change| format!("{change:.2}"))?,
             show("optimism", |share| format!("{:+.0} %", (100.0 * share).round() + 0.0))?,
             show("return_correlation", |correlation| format!("{correlation:.2}"))?,
-            beside("improvement_over_sac")?,
-            beside("earlier_than_sac")?,
+            interval("improvement_over_sac", "")?,
+            interval("earlier_than_sac", "")?,
         );
     }
     if rows.is_empty() {
@@ -186,7 +182,7 @@ fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<Str
 }
 
 /// How often the methods that learn a task were evaluated; a warning if not all alike.
-fn evaluations(tables: &Tables, task: &str) -> Result<String> {
+fn evaluations(tables: &Tables, task: &str, differ: bool) -> Result<String> {
     let grids = grids(tables, task)?;
     let one = |seeds: &[Curve]| {
         let (steps, episodes) = &seeds[0];
@@ -194,7 +190,7 @@ fn evaluations(tables: &Tables, task: &str) -> Result<String> {
         format!("every {every:.0} steps with {:.0} episodes", episodes[0])
     };
     let Some((_, first)) = grids.first() else { return Ok(String::new()) };
-    if !grids_differ(tables, task)? {
+    if !differ {
         return Ok(format!(
             "\nEvaluations: {}. A step by which {:.0} % success is reached is late by up to the distance of two.\n",
             one(first),
