@@ -189,6 +189,17 @@ fn train_evaluate_and_watch() {
     });
     assert!(returns[0] != returns[1] && returns[1] != returns[2] && returns[0] != returns[2], "{returns:?}");
 
+    // Other settings for the same weights, if these have the sizes that the settings ask for.
+    std::fs::write(here.join("slower.toml"), "[for.push.sac]\naction_repeat = 4\n").expect("a writable folder");
+    std::fs::write(here.join("wider.toml"), "[sac]\nhidden = [32, 64]\n").expect("a writable folder");
+    std::fs::write(here.join("wrong.toml"), "[sac]\naction_repeats = 4\n").expect("a writable folder");
+    let changed = |file| ["evaluate", "--run", "run", "--episodes", "3", "--seed", "0", "--json", "--config", file];
+    let output = handful(here, &changed("slower.toml"));
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert!(summary["return_mean"].as_f64().is_some_and(|with_repeats| with_repeats != returns[2]), "{summary}");
+    refused(here, &changed("wider.toml"), &["weights.safetensors", "has the sizes", "are expected"]);
+    refused(here, &changed("wrong.toml"), &["wrong.toml", "action_repeats"]);
+
     let output = handful(here, &["watch", "--run", "run", "--seed", "2"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     let page = std::fs::read_to_string(here.join("run/watch.html")).expect("a page");

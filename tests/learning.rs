@@ -519,6 +519,24 @@ fn a_damaged_checkpoint_is_named_and_kept() {
     assert_eq!(std::fs::read(&checkpoint).expect("still there").len(), whole.len() / 2);
 }
 
+/// With `explore_with_costs = false`, costs on effort and changes shape the motion in evaluations, and no bit of the training.
+#[test]
+fn costs_in_evaluations_only_leave_training_alone() {
+    let run_with = |explore_with_costs: bool, change_penalty: f32| {
+        let config = small_pets(0);
+        let mut pets: PetsConfig = config.settings().expect("PETS's settings");
+        pets.explore_with_costs = explore_with_costs;
+        pets.control.change_penalty = change_penalty;
+        let folder = tempfile::tempdir().expect("a folder");
+        finish(&mut open(&config.with_settings(&pets), folder.path()).expect("a new run"));
+        ["episodes.csv", "evaluations.csv"].map(|file| without_times(&folder.path().join(file)))
+    };
+    let [free, costly, costly_everywhere] = [(false, 0.0), (false, 1.0), (true, 1.0)].map(|(e, c)| run_with(e, c));
+    assert_eq!(free[0], costly[0], "the same episodes in training");
+    assert_ne!(free[1], costly[1], "other evaluations");
+    assert_ne!(free[0], costly_everywhere[0], "with costs, exploration differs");
+}
+
 /// A folder that an earlier version began is resumed: its keys had other names.
 #[test]
 fn renamed_keys_are_understood() {

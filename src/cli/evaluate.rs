@@ -23,13 +23,16 @@ pub(super) struct Args {
     /// The initial states: test, or development (on which settings are chosen) [default: those of the run's test]
     #[arg(long)]
     starts: Option<Starts>,
+    /// A TOML file with settings that differ from the run's, such as another planner for its model
+    #[arg(long)]
+    config: Option<PathBuf>,
     /// Answer in JSON
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
-    let (config, mut method) = registry.trained_method(&args.run)?;
+    let (config, mut method) = registry.trained_method_with(&args.run, args.config.as_deref())?;
     let seeds = args.seed.map_or(args.starts.unwrap_or(config.starts).test(), EvalSeeds::Seed);
     let mut evaluator = Evaluator::new(|| registry.make_env(&config))?;
     let mut evaluation = Evaluation::default();

@@ -32,7 +32,7 @@ impl Checkpoint for Pets {
         self.replay.load(state, "replay")?;
         self.observed = state.count("counts", self.replay.pushes())? as usize;
         self.rng = own;
-        self.controller = self.controllers.make(planner);
+        self.controller = self.controllers.explorer(planner);
         self.random.reset();
         Ok(())
     }

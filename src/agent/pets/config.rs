@@ -17,6 +17,9 @@ pub struct PetsConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
+    /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.
+    /// Without, an agent moves smoothly in evaluations, and still tries what costs more.
+    pub explore_with_costs: bool,
     /// Weight of the terminal reward: this many times the known reward of resting in a plan's last state is added to the
     /// plan's return, so that a short plan prefers to end well. Without effect if the reward is learned.
     pub terminal_weight: f32,
@@ -51,6 +54,7 @@ impl Default for PetsConfig {
             ensemble: EnsembleConfig::default(),
             planner: PlannerConfig::Icem(IcemConfig::default()),
             control: ControlConfig::default(),
+            explore_with_costs: true,
             terminal_weight: 0.0,
             propagation: Propagation::TsInf,
             particles: 5,
@@ -69,6 +73,7 @@ ranges!(PetsConfig {
     ensemble: Nested,
     planner: Nested,
     control: Nested,
+    explore_with_costs: Any,
     terminal_weight: 0.0..=1e6,
     propagation: Any,
     particles: 1..=10_000,

@@ -8,18 +8,25 @@ use crate::rng::{self, Rng};
 pub(super) struct MakeController {
     pub(super) planner: Box<dyn MakePlanner>,
     pub(super) config: ControlConfig,
+    pub(super) explore_with_costs: bool,
     pub(super) action_size: usize,
 }
 
 impl MakeController {
-    pub(super) fn make(&self, rng: Rng) -> Controller {
-        let planner = self.planner.make(self.action_size);
-        Controller { control: RecedingHorizon::new(planner, self.action_size, &self.config), rng }
+    /// The controller that explores.
+    pub(super) fn explorer(&self, rng: Rng) -> Controller {
+        let free = ControlConfig { effort_penalty: 0.0, change_penalty: 0.0, ..self.config.clone() };
+        self.make(if self.explore_with_costs { &self.config } else { &free }, rng)
     }
 
-    /// The controller of a slot, which depends on nothing but the slot's index.
+    /// The controller of a slot, for evaluations. It depends on nothing but the slot's index.
     pub(super) fn of_slot(&self, index: usize) -> Controller {
-        self.make(rng::stream(index as u64, "pets seat"))
+        self.make(&self.config, rng::stream(index as u64, "pets seat"))
+    }
+
+    fn make(&self, config: &ControlConfig, rng: Rng) -> Controller {
+        let planner = self.planner.make(self.action_size);
+        Controller { control: RecedingHorizon::new(planner, self.action_size, config), rng }
     }
 }
 

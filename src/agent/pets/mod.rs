@@ -121,6 +121,7 @@ impl Pets {
         let controllers = MakeController {
             planner: Box::new(config.planner.clone()),
             config: config.control.clone(),
+            explore_with_costs: config.explore_with_costs,
             action_size: spec.action_size,
         };
         Ok(Self {
@@ -129,7 +130,7 @@ impl Pets {
             replay: ReplayBuffer::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
-            controller: controllers.make(rng::stream(seed, "pets planner")),
+            controller: controllers.explorer(rng::stream(seed, "pets planner")),
             controllers,
             slots: Slots::default(),
             spec: spec.clone(),
@@ -144,7 +145,7 @@ impl Pets {
     #[must_use]
     pub fn with_planner(self, planner: impl MakePlanner + 'static) -> Self {
         let controllers = MakeController { planner: Box::new(planner), ..self.controllers };
-        Self { controller: controllers.make(self.controller.rng), controllers, slots: Slots::default(), ..self }
+        Self { controller: controllers.explorer(self.controller.rng), controllers, slots: Slots::default(), ..self }
     }
 
     /// The model that it plans in; None before the first fit.

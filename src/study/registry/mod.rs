@@ -144,14 +144,10 @@ impl Registry {
         steps: Option<usize>,
         file: Option<&Path>,
     ) -> Result<RunConfig> {
-        let env = self.env_entry(task)?;
-        let choices = self.agents.iter().flat_map(|agent| &agent.choices).chain(&env.choices).cloned();
-        let choices: Vec<String> = choices.collect();
+        let choices = self.choices(task)?;
         let mut table = preset_table(&self.presets, task, method, &choices)?;
         if let Some(path) = file {
-            let changes = self.changes(path, task, table.get("agent"), &choices)?;
-            merge(&mut table, changes, &choices);
-            check_choices(&table, &choices)?;
+            self.change(&mut table, path, task, &choices)?;
         }
         table.insert("task".into(), Value::String(task.into()));
         table.insert("method".into(), Value::String(method.into()));
@@ -167,6 +163,19 @@ impl Registry {
         let mut config = RunConfig::from_table(table).map_err(|problem| bad_config(path, &problem))?;
         self.complete(&mut config).map_err(|problem| bad_config(path, &problem))??;
         Ok(config)
+    }
+
+    /// The paths of the tables that name a variant, in the settings of a run on this task.
+    fn choices(&self, task: &str) -> Result<Vec<String>> {
+        let env = self.env_entry(task)?;
+        Ok(self.agents.iter().flat_map(|agent| &agent.choices).chain(&env.choices).cloned().collect())
+    }
+
+    /// Puts what a file says over the settings of a run on this task.
+    fn change(&self, table: &mut Table, path: &Path, task: &str, choices: &[String]) -> Result<()> {
+        let changes = self.changes(path, task, table.get("agent"), choices)?;
+        merge(table, changes, choices);
+        check_choices(table, choices)
     }
 
     /// What a file changes for a task, in a method with this kind of `agent`.
@@ -251,9 +260,25 @@ impl Registry {
     /// # Errors
     /// If there is no run, or its weights are missing, damaged, or another run's.
     pub fn trained_method(&self, folder: &Path) -> Result<(RunConfig, Method)> {
-        let (path, mut config) = read_config(folder)?;
-        let as_read = config.clone();
+        self.trained_method_with(folder, None)
+    }
+
+    /// As [`Registry::trained_method`], but the method acts with the settings that `file` changes: with another planner, for
+    /// example, in the model that the run has learned. Settings that shape its networks cannot change.
+    ///
+    /// # Errors
+    /// As [`Registry::trained_method`]; or if the file cannot be read, a field or value in it is wrong, or the weights do not fit
+    /// the changed settings.
+    pub fn trained_method_with(&self, folder: &Path, file: Option<&Path>) -> Result<(RunConfig, Method)> {
+        let (path, as_read) = read_config(folder)?;
+        let mut config = as_read.clone();
         self.complete(&mut config).map_err(|problem| bad_config(&path, &problem))??;
+        if let Some(file) = file {
+            let mut table = config.to_table();
+            self.change(&mut table, file, &config.task, &self.choices(&config.task)?)?;
+            config = RunConfig::from_table(table).map_err(|problem| bad_config(file, &problem))?;
+            self.complete(&mut config).map_err(|problem| bad_config(file, &problem))??;
+        }
         let mut method = self.method(&config)?;
         if config.learns() {
             load_weights(folder, &as_read, &mut method)?;
