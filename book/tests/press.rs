@@ -129,21 +129,28 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     quotes.push(("README.md", format!("SAC takes at least {ratio:.1} times as many (95 % interval from {low:.1})")));
     quotes.push(("chapters/00-start.md", format!("needs at least {ratio:.1} times as many")));
     let lift = |method: &str, column: &str| in_study("lift", "lift", method, column);
-    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_t_low"].map(|column| lift("pets", column));
-    let [pets, tdmpc2, sac] = ["pets", "tdmpc2", "sac"].map(|method| success("lift", "lift", method));
+    let [ratio, low, high] = ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"]
+        .map(|column| format!("{:.1}", lift("pets", column)));
+    let [pets, sac, tdmpc2, dreamer] =
+        ["pets", "sac", "tdmpc2", "dreamer"].map(|method| success("lift", "lift", method));
     let by = |method: &str| thousands(lift(method, "steps_to_80"));
+    let both = format!("in the median it is at 80 % by step {}, and SAC by step {}", by("pets"), by("sac"));
     quotes.extend([
-        ("README.md", format!("it is at 80 % by step {} in the median, with all five seeds", by("pets"))),
+        ("README.md", format!("it is at 80 % by step {} in the median, and SAC, of which all five", by("pets"))),
+        ("README.md", format!("takes {ratio} times as many steps (t interval from {low} to {high})")),
+        ("README.md", format!("TD-MPC2 is at 80 % by step {} in the median, with four", by("tdmpc2"))),
+        ("README.md", format!("and SAC by {}; five seeds", by("sac"))),
         (
             "README.md",
-            format!("SAC takes at least {ratio:.1} times as many (t interval from {low:.1}), and two of its"),
+            format!(
+                "PETS lifts in {pets} of the episodes, SAC in {sac}, TD-MPC2 in {tdmpc2}, and Dreamer in {dreamer}"
+            ),
         ),
-        ("README.md", format!("TD-MPC2 is at 80 % by step {} in the median, with four", by("tdmpc2"))),
-        ("README.md", format!("and SAC by {}, with three", by("sac"))),
-        ("README.md", format!("PETS lifts in {pets} of the episodes, TD-MPC2 in {tdmpc2}, and SAC in {sac}")),
         ("README.md", format!("PETS lifts in {pets} of the test episodes")),
+        ("chapters/06-pets.md", both),
     ]);
-    assert_eq!(["pets", "tdmpc2", "sac"].map(|method| lift(method, "seeds_reaching_80")), [5.0, 4.0, 3.0]);
+    let reaching = ["pets", "sac", "tdmpc2", "dreamer"].map(|method| lift(method, "seeds_reaching_80"));
+    assert_eq!(reaching, [5.0, 5.0, 4.0, 1.0]);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("tdmpc2", column));
     quotes.push(("README.md", format!("(SAC takes at least {ratio:.1} times as many, interval from {low:.1})")));
     let tdmpc2 = format!("SAC takes at least {ratio:.1} times as many steps (95 % interval from {low:.1};");
