@@ -1,4 +1,4 @@
-//! The time of a gradient next to that of its roll-out: forward mode, reverse mode (adjoint method) and central differences, on
+//! The time of a gradient next to that of its rollout: forward mode, reverse mode (adjoint method) and central differences, on
 //! the planar pusher, as the horizon grows. Two numbers in an action.
 //!
 //! The time of the Jacobians of a control step next to that of the step, on the arm: columns one at a time, as `linearise` has them,
@@ -26,7 +26,7 @@ fn gradients(c: &mut Criterion) {
     (start[0], start[1]) = (-0.04, 0.004);
     for horizon in [5, 20, 80] {
         let actions = vec![SVector::from([0.4, 0.05]); horizon];
-        group.bench_function(BenchmarkId::new("roll-out", horizon), |b| {
+        group.bench_function(BenchmarkId::new("rollout", horizon), |b| {
             b.iter(|| black_box(roll_out(&task, &start, &actions)))
         });
         group.bench_function(BenchmarkId::new("reverse", horizon), |b| {

@@ -163,6 +163,55 @@ fn a_small_study_from_start_to_report() {
     }
 }
 
+/// Runs of several machines, or of several days, make one study.
+#[test]
+fn studies_are_joined() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let study = |methods: &str, seeds: &str, out: &str| {
+        let output = ["study", "--tasks", "cartpole", "--methods", methods, "--seeds", seeds, "--out", out];
+        let output = handful(here, &output);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+    };
+    study("random,debug", "0..2", "whole");
+    study("random,debug", "0..1", "first");
+    study("debug", "1..2", "second");
+    let join = |studies: &[&str], out: &str| {
+        let from = studies.iter().flat_map(|study| ["--from", study]);
+        handful(here, &["report"].into_iter().chain(from).chain(["--out", out]).collect::<Vec<_>>())
+    };
+    let joined = join(&["first", "second"], "joined");
+    assert!(joined.status.success(), "{}", text(&joined.stderr));
+    let read = |file: &str| std::fs::read_to_string(here.join(file)).expect(file);
+    // White space around a cell is not read.
+    let table = |file: &str| read(file).replace("\n\"", "\"");
+    for file in ["tests.csv", "runs.csv", "models.csv", "values.csv"] {
+        assert_eq!(table(&format!("joined/{file}")), table(&format!("whole/{file}")), "{file}");
+    }
+    // The methods' numbers of steps and successes; later columns hold seconds.
+    let of_summary = |study: &str| -> Vec<String> {
+        let columns = |line: &str| line.split(',').take(10).collect::<Vec<_>>().join(",");
+        read(&format!("{study}/summary.csv")).lines().map(columns).collect()
+    };
+    assert_eq!(of_summary("joined"), of_summary("whole"));
+    // The median seed of debug is not known; that of random is.
+    assert!(read("joined/replays.csv").contains("random") && !read("joined/replays.csv").contains("debug"));
+
+    // A run that is there twice counts once, and the report names it.
+    assert!(join(&["first", "whole"], "twice").status.success());
+    assert_eq!(read("twice/tests.csv"), read("whole/tests.csv"));
+    assert!(read("twice/report.md").contains("whole: debug on cartpole with seed 0` (`it is there twice`)"));
+
+    // So does one of several kinds: the first.
+    let other = read("second/runs.csv").replace("evaluate_every = ", "evaluate_every = 7");
+    std::fs::write(here.join("second/runs.csv"), other).expect("a writable table");
+    assert!(join(&["first", "second"], "mixed").status.success());
+    assert!(read("mixed/left_out.csv").contains("another configuration (its `evaluate_every` is "));
+
+    refused(here, &["report", "--from", "first", "--from", "second"], &["several studies", "--out"]);
+    refused(here, &["report", "--from", "first", "--from", "whole", "--out", "whole"], &["whole", "joined", "--out"]);
+}
+
 #[test]
 fn train_evaluate_and_watch() {
     let folder = tempfile::tempdir().expect("a folder");

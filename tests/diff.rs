@@ -35,7 +35,7 @@ fn close(what: &str, a: f64, b: f64, scale: f64, tolerance: f64) {
     assert!((a - b).abs() <= tolerance * scale, "{what}: {a} and {b}, where {scale} is large");
 }
 
-/// Forward mode, reverse mode and differences of a roll-out; Jacobians and differences of its first step.
+/// Forward mode, reverse mode and differences of a rollout; Jacobians and differences of its first step.
 fn gradients_agree<const N: usize, const M: usize>(
     system: &impl System<N, M>,
     start: &SVector<f64, N>,
@@ -78,7 +78,7 @@ fn every_way_to_a_gradient_leads_to_the_same_one() {
     }
 }
 
-/// The hand runs into the block: contact lies within the roll-out.
+/// The hand runs into the block: contact lies within the rollout.
 #[test]
 fn so_it_does_through_contact() {
     let mut rng = rng::stream(1, "diff");

@@ -1,7 +1,7 @@
-//! Derivatives of steps and of roll-outs.
+//! Derivatives of steps and of rollouts.
 //!
-//! *Forward mode* pushes one direction through the roll-out: its cost grows with the number of actions. *Reverse mode* (the
-//! adjoint method, or backpropagation through time) goes back through the roll-out once, whatever their number; it keeps all
+//! *Forward mode* pushes one direction through the rollout: its cost grows with the number of actions. *Reverse mode* (the
+//! adjoint method, or backpropagation through time) goes back through the rollout once, whatever their number; it keeps all
 //! states (`N` numbers a step) and the Jacobians of one step at a time, which forward mode computes.
 //!
 //! ```
@@ -78,7 +78,7 @@ fn linearise_by_columns<Sys: System<N, M>, const N: usize, const M: usize>(
     Linear { next, by_state, by_action }
 }
 
-/// The cost of a roll-out and its gradients with respect to every action and to the start, by reverse mode. With the cost
+/// The cost of a rollout and its gradients with respect to every action and to the start, by reverse mode. With the cost
 /// c of a step f, the adjoint lambda obeys (from the final cost's gradient backwards)
 ///
 /// dJ/da_t = dc/da_t + (df/da_t)' lambda_{t+1},   lambda_t = dc/ds_t + (df/ds_t)' lambda_{t+1}.
@@ -108,7 +108,7 @@ pub fn gradient<const N: usize, const M: usize>(
     (cost, by_actions, adjoint)
 }
 
-/// The same gradient with respect to the actions by forward mode: a whole roll-out for each number of each action.
+/// The same gradient with respect to the actions by forward mode: a whole rollout for each number of each action.
 #[doc(alias = "forward mode")]
 #[doc(alias = "dual numbers")]
 pub fn gradient_forward<const N: usize, const M: usize>(

@@ -88,7 +88,7 @@ impl Ilqr {
         Self { config }
     }
 
-    /// Optimises the actions of a roll-out from `start`, beginning with `guess`, which is as long as the solution.
+    /// Optimises the actions of a rollout from `start`, beginning with `guess`, which is as long as the solution.
     pub fn solve<const N: usize, const M: usize>(
         &self,
         system: &impl System<N, M>,

@@ -2,7 +2,7 @@
 //! through them.
 //!
 //! A [`System`] is such a simulator with a cost to be minimised. [`derivatives`] has the Jacobians of a step and the gradients of
-//! whole roll-outs in forward mode and in reverse mode (the adjoint method). Built on them:
+//! whole rollouts in forward mode and in reverse mode (the adjoint method). Built on them:
 //!
 //! - [`Ilqr`]: trajectory optimisation, and receding-horizon control with it ([`IlqrControl`]);
 //! - [`AnalyticPolicyGradient`]: a policy network trained by backpropagation through simulator and network;
@@ -84,7 +84,7 @@ pub trait System<const N: usize, const M: usize>: Sync {
     /// The cost of an action in a state.
     fn cost<S: RealField + Copy>(&self, state: &SVector<S, N>, action: &SVector<S, M>) -> S;
 
-    /// The cost of the state that a roll-out ends in.
+    /// The cost of the state that a rollout ends in.
     fn final_cost<S: RealField + Copy>(&self, state: &SVector<S, N>) -> S;
 }
 

@@ -274,7 +274,8 @@ pub(super) fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String
     difference_in("", &there.to_table(), &wanted.to_table())
 }
 
-fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
+/// The same for settings whose names begin with `path`.
+pub(super) fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
     let key = there.keys().chain(wanted.keys()).find(|key| there.get(*key) != wanted.get(*key))?;
     let name = format!("{path}{key}");
     match (there.get(key), wanted.get(key)) {

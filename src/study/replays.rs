@@ -100,6 +100,27 @@ pub(super) fn copy(replays: &[Replay], from: &Path, to: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Joins the recordings of several studies in the folder `to`, except those of methods that more than one of them has: the median seed of
+/// all is not known without the weights.
+///
+/// # Errors
+/// If a file cannot be read or written.
+pub(super) fn join(folders: &[PathBuf], to: &Path) -> Result<()> {
+    let mut studies = Vec::new();
+    for folder in folders {
+        studies.push((folder, read(folder)?));
+    }
+    let alike = |a: &Replay, b: &Replay| (&a.task, &a.method) == (&b.task, &b.method);
+    let with = |replay: &Replay| studies.iter().filter(|(_, of)| of.iter().any(|other| alike(other, replay))).count();
+    let mut rows = Vec::new();
+    for (folder, replays) in &studies {
+        let own: Vec<Replay> = replays.iter().filter(|replay| with(replay) == 1).cloned().collect();
+        copy(&own, folder, to)?;
+        rows.extend(own);
+    }
+    write_csv(&to.join(TABLE), &COLUMNS, rows.iter())
+}
+
 /// The recorded episodes of a task, a row for each method.
 pub(super) fn table(replays: &[Replay], task: &str) -> String {
     let of_task: Vec<&Replay> = replays.iter().filter(|replay| replay.task == task).collect();

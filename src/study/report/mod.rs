@@ -3,7 +3,7 @@
 mod results;
 mod task;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::page;
@@ -61,6 +61,15 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     files::write(&to.join("report.md"), text.as_bytes())?;
     files::write(&to.join("report.html"), page::page(&text, to)?.as_bytes())?;
     Ok(tuning_note(&tables)?.to_string() + &results::text_table(&tables)?)
+}
+
+/// Joins the tables and recordings of several studies ([`Tables::read_all`]) into a study in the folder `to`.
+///
+/// # Errors
+/// If the studies cannot be joined, or if a file cannot be read or written.
+pub fn join(folders: &[PathBuf], to: &Path) -> Result<()> {
+    Tables::read_all(folders)?.write(to)?;
+    replays::join(folders, to)
 }
 
 /// What stands above the numbers of runs that served to choose settings.

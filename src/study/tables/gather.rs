@@ -21,28 +21,20 @@ impl Tables {
     /// others on development starts.
     pub fn gather<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Result<Self> {
         let mut collected = Collected::default();
-        let (mut left_out, mut reasons, mut first) = (Vec::new(), Vec::new(), None);
+        let (mut missing, mut first) = (Vec::new(), None);
         for folder in folders {
             if let Err(problem) = collected.take_in(folder) {
-                left_out.push(folder.display().to_string());
-                reasons.push(problem.to_string());
+                missing.push((folder.display().to_string(), problem.to_string()));
                 first.get_or_insert(problem);
             }
         }
         if let Some(problem) = first.filter(|_| collected.tests.is_empty()) {
             return Err(problem);
         }
-        let left_out = match left_out.len() {
-            0 => Ok(DataFrame::empty()),
-            _ => DataFrame::new_infer_height(vec![
-                Column::new("run".into(), left_out),
-                Column::new("reason".into(), reasons),
-            ]),
-        };
         let Collected { evaluations, models, values, tests, runs, .. } = collected;
-        let joined =
-            || -> PolarsResult<[DataFrame; 4]> { Ok([join(evaluations)?, join(models)?, join(values)?, join(tests)?]) };
-        Self::summarised(joined().map_err(inside)?, join(runs).map_err(inside)?, left_out.map_err(inside)?)
+        let joined = |rows: Vec<LazyFrame>| concatenate(rows).map_err(inside);
+        let results = [joined(evaluations)?, joined(models)?, joined(values)?, joined(tests)?];
+        Self::summarised(results, joined(runs)?, left_out(missing).map_err(inside)?)
     }
 }
 
@@ -74,7 +66,7 @@ impl Collected {
         let method = (config.task.clone(), config.method.clone());
         if let Some(other) = self.configurations.get(&method) {
             let like_it = RunConfig { seed: other.seed, starts: other.starts, ..config.clone() };
-            if let Some(difference) = difference(other, &like_it) {
+            if let Some(difference) = difference(&like_it, other) {
                 let problem = format!(
                     "`{}` on `{}` with seed {} has another configuration than with seed {} ({difference})",
                     config.method, config.task, config.seed, other.seed
@@ -120,7 +112,17 @@ impl Collected {
     }
 }
 
-fn join(frames: Vec<LazyFrame>) -> PolarsResult<DataFrame> {
+/// The table of runs that are in no other table, each with the reason; without columns if there is none.
+pub(super) fn left_out(runs: Vec<(String, String)>) -> PolarsResult<DataFrame> {
+    if runs.is_empty() {
+        return Ok(DataFrame::empty());
+    }
+    let (runs, reasons): (Vec<String>, Vec<String>) = runs.into_iter().unzip();
+    DataFrame::new_infer_height(vec![Column::new("run".into(), runs), Column::new("reason".into(), reasons)])
+}
+
+/// One below the other; all have the same columns.
+pub(super) fn concatenate(frames: Vec<LazyFrame>) -> PolarsResult<DataFrame> {
     let options = UnionArgs { to_supertypes: true, ..UnionArgs::default() };
     if frames.is_empty() { Ok(DataFrame::empty()) } else { concat(frames, options)?.collect() }
 }

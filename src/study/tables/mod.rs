@@ -8,6 +8,7 @@ use std::path::Path;
 use polars::prelude::*;
 
 mod gather;
+mod join;
 mod read;
 mod runs;
 
