@@ -350,7 +350,7 @@ fn latent_models_predict_too() {
 fn gradients_of_imagined_returns_are_exact() {
     let known = fitted(config()).dynamics();
     let learned = fitted(EnsembleConfig { learn_reward: true, ..config() }).dynamics();
-    assert!(learned.predicts_reward() && !known.predicts_reward());
+    assert!(learned.learned_reward().is_some() && known.learned_reward().is_none());
     let actions: Vec<f32> = (0..12).map(|i| 0.8 * (i as f32).sin()).collect();
     let obs = seen(0.2, -0.1);
     let gated = fitted(EnsembleConfig { gated: true, ..config() }).dynamics();
@@ -497,16 +497,17 @@ fn a_cube_may_lie_on_any_side() {
     }
 }
 
-/// A goal does not move, so the dynamics need not see it; but a learned reward must.
+/// A goal does not move, so the dynamics need not see it; but a learned reward must, also where it has never been.
 #[test]
-fn a_learned_reward_sees_the_goal() {
+fn a_learned_reward_knows_goals_that_it_has_not_seen() {
     let features = [Feature::new("x"), Feature::new("goal").constant(), Feature::new("way").difference("goal", "x")];
     let spec = Spec::new("line", features, 1, 50, 0.1);
     let mut rng = rng::stream(0, "goals");
     let mut data = ReplayBuffer::new(3, 1, 2000);
-    for _ in 0..2000 {
-        let [x, goal, action] = [0; 3].map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32);
-        let next = x + 0.1 * action;
+    for i in 0..2000 {
+        let [x, action] = [0; 2].map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32);
+        // Eight goals: -0.7, -0.5, ... 0.7.
+        let (goal, next) = ((i % 8) as f32 * 0.2 - 0.7, x + 0.1 * action);
         data.push(&Transition {
             obs: vec![x, goal, goal - x],
             action: vec![action],
@@ -518,13 +519,49 @@ fn a_learned_reward_sees_the_goal() {
     }
     let mut ensemble =
         Ensemble::new(&spec, EnsembleConfig { learn_reward: true, ..config() }, &mut rng).expect("usable settings");
-    ensemble.fit(&data, &mut rng);
-    let reward =
-        |x: f32, goal: f32| *ensemble.dynamics().predict(&[x, goal, goal - x], &[0.0]).mean.last().expect("a reward");
-    for (x, goal) in [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.8, 0.7)] {
-        let (predicted, truth) = (reward(x, goal), -f64::from((goal - x).abs()));
+    assert_eq!(ensemble.fit(&data, &mut rng).reward_errors.len(), ensemble.dynamics().members());
+    let dynamics = ensemble.dynamics();
+    let learned = dynamics.learned_reward().expect("a learned reward");
+    let at = |x: f32, goal: f32| vec![x, goal, goal - x];
+    let reward = |x: f32, goal: f32| learned.reward(&at(x, goal), &[0.0], &at(x, goal));
+    for (x, goal) in [(0.6, 0.6), (-0.5, 0.6), (0.6, -0.4), (-0.8, 0.0)] {
+        let (predicted, truth) = (reward(x, goal), -(goal - x).abs());
         assert!((predicted - truth).abs() < 0.15, "at {x}, goal {goal}: {predicted}, not {truth}");
     }
+
+    // It is the mean of the members, for each row of a batch.
+    let (here, there) = ([at(0.1, 0.5), at(-0.2, 0.3)].concat(), [at(0.2, 0.5), at(-0.3, 0.3)].concat());
+    let rewards_of = |member: usize| {
+        let mut rewards = [0.0; 2];
+        learned.of_member(member, &here, &[1.0, -1.0], &there, &mut rewards);
+        rewards
+    };
+    let of_members: Vec<[f32; 2]> = (0..learned.members()).map(rewards_of).collect();
+    for row in 0..2 {
+        let mean = of_members.iter().map(|rewards| rewards[row]).sum::<f32>() / learned.members() as f32;
+        let transition = [&here[3 * row..][..3], &there[3 * row..][..3]];
+        let reward = learned.reward(transition[0], &[[1.0, -1.0][row]], transition[1]);
+        assert!((reward - mean).abs() < 1e-6, "{reward}, not {mean}");
+    }
+    // Far from all data it stays within the rewards that were received.
+    let received: Vec<f32> = (0..data.len()).map(|i| data.row(i).reward).collect();
+    let (low, high) = received.iter().fold((f32::MAX, f32::MIN), |(low, high), r| (low.min(*r), high.max(*r)));
+    for x in [-1e6, -30.0, 30.0, 1e6] {
+        let predicted = reward(x, 0.3);
+        assert!((low - 1e-4..=high + 1e-4).contains(&predicted), "at {x}: {predicted}, received {low} to {high}");
+    }
+}
+
+#[test]
+fn a_learned_reward_is_saved_and_loaded() {
+    let learned = fitted(EnsembleConfig { learn_reward: true, ..config() });
+    let (obs, action) = (seen(0.3, 0.1), [0.4]);
+    let mut copy =
+        Ensemble::new(&spec(), EnsembleConfig { learn_reward: true, ..config() }, &mut rng::stream(9, "copy"))
+            .expect("usable settings");
+    copy.load_weights(&learned.weights()).expect("the same settings");
+    let reward = |of: &Ensemble| of.dynamics().learned_reward().expect("a learned reward").reward(&obs, &action, &obs);
+    assert_eq!(reward(&copy), reward(&learned));
 }
 
 #[test]

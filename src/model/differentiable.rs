@@ -1,24 +1,25 @@
 //! Gradients of imagined returns with respect to actions: backpropagation through time through the networks.
 //!
-//! Each member follows its own mean without noise, as with [`super::Propagation::TsInfMean`]. A known reward is
-//! differentiated by central differences, because it is a cheap function of a few numbers. Cubes are brought into
+//! Each member follows its own mean without noise, as with [`super::Propagation::TsInfMean`]. Rewards, known or learned, are
+//! differentiated by central differences. Cubes are brought into
 //! canonical orientation at the start only; their axes are not orthonormalized on the way.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
+use super::ensemble::LearnedReward;
+use super::imagination::NO_REWARD;
 use super::{Dynamics, FeatureMap, Reward};
-use crate::env::KnownReward;
 use crate::nn::{Activation, Grad, Mlp, Tensor3, device, ops, tensor, values};
 
-/// Step of the central differences of a known reward.
+/// Step of the central differences of a reward.
 const STEP: f32 = 1e-3;
 
 /// The networks of a [`Dynamics`] as a differentiable simulator.
 ///
 /// Everything around the networks is linear (but for the tanh features), so it is two more layers without trainable
-/// weights: one selects and normalises features and action; one adds the predicted changes to the observation, recomputes
-/// the differences, and appends the reward if that is learned.
+/// weights: one selects and normalises features and action; one adds the predicted changes to the observation and recomputes
+/// the differences.
 #[doc(alias = "backpropagation through time")]
 #[doc(alias = "BPTT")]
 #[derive(Clone, Debug)]
@@ -35,6 +36,7 @@ pub struct Differentiable {
     observation: usize,
     actions: usize,
     outputs: usize,
+    reward: Option<LearnedReward>,
 }
 
 /// A linear layer with fixed weights, the same for each member.
@@ -79,13 +81,11 @@ impl Differentiable {
             after_tanh[j][raw + j] = 1.0 / inputs.scale[raw + j];
         }
 
-        // From observation and normalised changes to the next observation, followed by the reward.
-        let reward = dynamics.predicts_reward().then_some(width);
-        let columns = width + usize::from(reward.is_some());
-        let mut exit = vec![vec![0.0; columns]; width + outputs];
-        let mut bias = vec![0.0; columns];
+        // From observation and normalised changes to the next observation.
+        let mut exit = vec![vec![0.0; width]; width + outputs];
+        let mut bias = vec![0.0; width];
         (0..width).for_each(|i| exit[i][i] = 1.0);
-        for (j, i) in features.predicted.iter().copied().chain(reward).enumerate() {
+        for (j, &i) in features.predicted.iter().enumerate() {
             exit[width + j][i] = targets.scale[j];
             bias[i] = targets.mean[j];
         }
@@ -110,6 +110,7 @@ impl Differentiable {
             observation: width,
             actions,
             outputs,
+            reward: dynamics.learned_reward().cloned(),
             cpu,
         }
     }
@@ -157,12 +158,24 @@ impl Differentiable {
             let head = if self.gated { ops::gated(head) } else { head };
             let changes = head.slice((.., .., ..self.outputs));
             let (changes, recorded) = changes.split_tape();
-            let (after, recorded) =
-                self.exit.forward(ops::join(state.clone().put_tape(recorded), changes)).split_tape();
-            let (next, recorded) = after.clone().put_tape(recorded).slice((.., .., ..self.observation)).split_tape();
+            let (next, recorded) = self.exit.forward(ops::join(state.clone().put_tape(recorded), changes)).split_tape();
+            let next_on_tape = next.clone().put_tape(recorded);
             let reward_of_step = match reward {
-                Reward::Learned => after.put_tape(recorded).slice((.., .., self.observation..)),
-                Reward::Known(known) => known_reward(known, &state, action, next.clone().put_tape(recorded)),
+                Reward::Known(known) => reward_on(
+                    &|_, [obs, action, next], rewards| known.rewards(obs, action, next, rewards),
+                    &state,
+                    action,
+                    next_on_tape,
+                ),
+                Reward::Learned => {
+                    let learned = self.reward.as_ref().expect(NO_REWARD);
+                    reward_on(
+                        &|member, [obs, action, next], rewards| learned.of_member(member, obs, action, next, rewards),
+                        &state,
+                        action,
+                        next_on_tape,
+                    )
+                }
             };
             let (reward_of_step, recorded) = reward_of_step.split_tape();
             let next = next.put_tape(recorded);
@@ -206,31 +219,31 @@ fn mean_minus_std(returns: &[f32], members: usize, disagreement_penalty: f32) ->
     (scores, weights)
 }
 
-/// The known reward of a time step, `[members, candidates, 1]`.
-fn known_reward<T: Tape<f32, Cpu>>(
-    known: &(dyn KnownReward + Sync),
-    obs: &Tensor3,
-    action: &Tensor3,
-    next: Tensor3<T>,
-) -> Tensor3<T> {
+/// Writes the rewards that a member expects of transitions: rows of observations, actions and next observations.
+type RewardOf<'a> = dyn Fn(usize, [&[f32]; 3], &mut [f32]) + 'a;
+
+/// The reward of a time step, `[members, candidates, 1]`.
+fn reward_on<T: Tape<f32, Cpu>>(reward: &RewardOf, obs: &Tensor3, action: &Tensor3, next: Tensor3<T>) -> Tensor3<T> {
     let (next, mut tape) = next.split_tape();
     let &(members, candidates, width) = obs.shape();
     let act = action.shape().2;
-    let rows =
-        || values(obs).chunks_exact(width).zip(values(action).chunks_exact(act)).zip(values(&next).chunks_exact(width));
-    let rewards = rows().map(|((obs, action), next)| known.reward(obs, action, next)).collect();
-    // Derivatives of the reward with respect to observation, action and next observation, side by side.
-    let slopes: Vec<f32> = if T::OWNS_TAPE {
-        rows().flat_map(|((obs, action), next)| slopes_of(known, [obs, action, next])).collect()
-    } else {
-        Vec::new()
+    let parts = [values(obs), values(action), values(&next)];
+    let of_member = |member: usize| {
+        let rows = |part: usize, width: usize| &parts[part][member * candidates * width..][..candidates * width];
+        [rows(0, width), rows(1, act), rows(2, width)]
     };
-    let reward = obs.device().tensor_from_vec(rewards, (members, candidates, 1));
+    let mut rewards = vec![0.0; members * candidates];
+    for (member, rewards) in rewards.chunks_exact_mut(candidates).enumerate() {
+        reward(member, of_member(member), rewards);
+    }
+    let on_tape = obs.device().tensor_from_vec(rewards, (members, candidates, 1));
     if T::OWNS_TAPE {
+        // Derivatives of the reward with respect to observation, action and next observation, side by side.
+        let slopes: Vec<f32> = (0..members).flat_map(|m| slopes_of(reward, m, of_member(m), candidates)).collect();
         let parts = [obs.clone(), action.clone(), next];
-        let reward = reward.clone();
+        let on_tape = on_tape.clone();
         tape.add_backward_op(move |gradients| {
-            let d = ops::take(gradients, &reward)?;
+            let d = ops::take(gradients, &on_tape)?;
             let whole = 2 * width + act;
             let mut from = 0;
             for part in &parts {
@@ -244,24 +257,29 @@ fn known_reward<T: Tape<f32, Cpu>>(
             Ok(())
         });
     }
-    reward.put_tape(tape)
+    on_tape.put_tape(tape)
 }
 
-/// Central differences of a reward with respect to its three arguments, side by side.
-fn slopes_of(known: &(dyn KnownReward + Sync), parts: [&[f32]; 3]) -> Vec<f32> {
-    let mut parts = parts.map(<[f32]>::to_vec);
-    let mut slopes = Vec::with_capacity(parts.iter().map(Vec::len).sum());
-    for part in 0..3 {
-        for i in 0..parts[part].len() {
-            let here = parts[part][i];
-            let mut at = |x: f32| {
-                parts[part][i] = x;
-                known.reward(&parts[0], &parts[1], &parts[2])
-            };
-            let difference = at(here + STEP) - at(here - STEP);
-            at(here);
-            slopes.push(difference / (2.0 * STEP));
+/// Central differences of a member's rewards with respect to the three parts of each transition, `[candidates, numbers]`.
+fn slopes_of(reward: &RewardOf, member: usize, parts: [&[f32]; 3], candidates: usize) -> Vec<f32> {
+    let widths = parts.map(|part| part.len() / candidates);
+    let whole: usize = widths.iter().sum();
+    let mut slopes = Vec::with_capacity(candidates * whole);
+    let mut rewards = vec![0.0; 2 * whole];
+    for candidate in 0..candidates {
+        // Each transition 2 x `whole` times, with one number moved up and down.
+        let mut moved: [Vec<f32>; 3] =
+            std::array::from_fn(|part| parts[part][candidate * widths[part]..][..widths[part]].repeat(2 * whole));
+        let mut row = 0;
+        for (rows, width) in moved.iter_mut().zip(widths) {
+            for i in 0..width {
+                rows[row * width + i] += STEP;
+                rows[(row + 1) * width + i] -= STEP;
+                row += 2;
+            }
         }
+        reward(member, [&moved[0], &moved[1], &moved[2]], &mut rewards);
+        slopes.extend(rewards.chunks_exact(2).map(|pair| (pair[0] - pair[1]) / (2.0 * STEP)));
     }
     slopes
 }

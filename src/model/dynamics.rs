@@ -2,6 +2,7 @@
 
 use dfdx::tensor::Cpu;
 
+use super::ensemble::LearnedReward;
 use super::uncertainty::split;
 use super::{FeatureMap, Normaliser};
 use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
@@ -22,10 +23,11 @@ pub struct Dynamics {
     /// Minimum precision and minimum variance of each output, normalised, for each member: see [`bounded_variance`].
     floors: Vec<[Vec<f32>; 2]>,
     temperature: Vec<f32>,
+    reward: Option<LearnedReward>,
 }
 
-/// The ensemble's prediction of one time step: one entry for each predicted feature (in the order of
-/// [`Dynamics::typical_changes`]), then one for the reward if it is learned.
+/// The ensemble's prediction of one time step: one entry for each predicted feature, in the order of
+/// [`Dynamics::typical_changes`].
 ///
 /// `aleatoric + epistemic` is the total variance of the mixture of all members.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,7 +65,11 @@ impl Dynamics {
             [max.iter().map(|max| (-max).exp()).collect(), min.iter().map(|min| min.exp()).collect()]
         };
         let (members, floors) = members.map(|(network, bounds)| (network, floors(bounds))).unzip();
-        Self { members, features, actions, inputs, targets, floors, temperature }
+        Self { members, features, actions, inputs, targets, floors, temperature, reward: None }
+    }
+
+    pub(super) fn with_reward(self, reward: Option<LearnedReward>) -> Self {
+        Self { reward, ..self }
     }
 
     /// Number of members.
@@ -81,9 +87,9 @@ impl Dynamics {
         self.actions
     }
 
-    /// Whether the reward is predicted too ([`EnsembleConfig::learn_reward`](super::EnsembleConfig::learn_reward)).
-    pub fn predicts_reward(&self) -> bool {
-        self.outputs() > self.features.predicted.len()
+    /// The learned reward; none unless [`EnsembleConfig::learn_reward`](super::EnsembleConfig::learn_reward) is set.
+    pub fn learned_reward(&self) -> Option<&LearnedReward> {
+        self.reward.as_ref()
     }
 
     /// Index of each predicted feature of an observation, with the standard deviation of its change per time step in the
@@ -115,8 +121,7 @@ impl Dynamics {
         let predict = |member: usize| {
             let head = self.forward(member, 0..1, obs, action, &mut scratch);
             let (change, std) = head.split_at(outputs);
-            // The reward is predicted directly, the observation by its change.
-            let before = self.features.predicted.iter().map(|i| obs[*i]).chain(std::iter::repeat(0.0));
+            let before = self.features.predicted.iter().map(|i| obs[*i]);
             let mean = change.iter().zip(before).map(|(change, before)| f64::from(before) + f64::from(*change));
             (mean.collect(), std.iter().map(|std| f64::from(*std).powi(2)).collect())
         };
@@ -129,7 +134,7 @@ impl Dynamics {
         Mlp::from_layers(cpu, &members, Activation::Silu)
     }
 
-    /// Outputs: predicted features, and the reward if it is learned.
+    /// Outputs: predicted features.
     pub(super) fn outputs(&self) -> usize {
         self.targets.mean.len()
     }

@@ -2,7 +2,7 @@
 //!
 //! | model | predicts | paper |
 //! | --- | --- | --- |
-//! | [`Ensemble`] | the next observation, as a Gaussian per member | PETS (Chua et al. 2018) |
+//! | [`Ensemble`] | the next observation, as a Gaussian per member; the reward, if it is not known | PETS (Chua et al. 2018) |
 //! | [`Autoencoder`] | the next code of an observation, deterministically | |
 //! | [`WorldModel`] | the next latent state, from a history of observations | PlaNet, Dreamer (Hafner et al. 2019, 2023) |
 //! | [`ImplicitModel`] | the next latent state, rewards and values, but no observation | TD-MPC2 (Hansen et al. 2024) |
@@ -57,7 +57,7 @@ mod world_model;
 pub use autoencoder::{Autoencoder, AutoencoderConfig};
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
-pub use ensemble::{Ensemble, EnsembleConfig, Fit};
+pub use ensemble::{Ensemble, EnsembleConfig, Fit, LearnedReward};
 pub use features::{Cube, FeatureMap, LatentFeatures, Normaliser};
 pub use imagination::{Imagination, ImaginedReturns, Propagation, Reward, Value};
 pub use implicit::{ImplicitConfig, ImplicitLoss, ImplicitModel, PolicyPrior, Probe, Probed};

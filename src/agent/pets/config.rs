@@ -20,8 +20,8 @@ pub struct PetsConfig {
     /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.
     /// Without, an agent moves smoothly in evaluations, and still tries what costs more.
     pub explore_with_costs: bool,
-    /// Weight of the terminal reward: this many times the known reward of resting in a plan's last state is added to the
-    /// plan's return, so that a short plan prefers to end well. Without effect if the reward is learned.
+    /// Weight of the terminal reward: this many times the reward of resting in a plan's last state is added to the plan's
+    /// return, so that a short plan prefers to end well.
     pub terminal_weight: f32,
     /// How uncertainty is propagated along imagined trajectories.
     #[doc(alias = "trajectory sampling")]

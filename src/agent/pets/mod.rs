@@ -165,6 +165,10 @@ impl Pets {
             let mean = fit.errors.iter().sum::<f64>() / fit.errors.len() as f64;
             losses.insert("model_error", mean as f32);
         }
+        if !fit.reward_errors.is_empty() {
+            let mean = fit.reward_errors.iter().sum::<f64>() / fit.reward_errors.len() as f64;
+            losses.insert("reward_error", mean as f32);
+        }
         losses
     }
 }

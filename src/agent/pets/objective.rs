@@ -2,6 +2,7 @@
 
 use super::{DynReward, PetsConfig};
 use crate::agent::ImaginedTrajectory;
+use crate::env::KnownReward;
 use crate::model::uncertainty::Risk;
 use crate::model::{Differentiable, Dynamics, Imagination, ImaginedReturns, Reward, Value};
 use crate::plan::{ActionSequences, Objective};
@@ -49,9 +50,14 @@ pub(super) struct PlanningModel<'a> {
 impl<'a> PlanningModel<'a> {
     pub(super) fn new(config: &'a PetsConfig, dynamics: &'a Dynamics, reward: Option<&'a DynReward>) -> Self {
         let reward = reward.filter(|_| !config.ensemble.learn_reward);
-        let rest = vec![0.0; dynamics.action_size()];
-        let terminal = reward.filter(|_| config.terminal_weight > 0.0).map(|reward| -> Box<Value<'a>> {
-            Box::new(move |state: &[f32]| config.terminal_weight * reward.reward(state, &rest, state))
+        let of_rest = reward.map(|known| known as &(dyn KnownReward + Sync));
+        let of_rest = of_rest.or_else(|| dynamics.learned_reward().map(|learned| learned as _));
+        let actions = dynamics.action_size();
+        let terminal = of_rest.filter(|_| config.terminal_weight > 0.0).map(|reward| -> Box<Value<'a>> {
+            Box::new(move |states: &[f32], values: &mut [f32]| {
+                reward.rewards(states, &vec![0.0; values.len() * actions], states, values);
+                values.iter_mut().for_each(|value| *value *= config.terminal_weight);
+            })
         });
         Self { config, dynamics, reward, terminal }
     }

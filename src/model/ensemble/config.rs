@@ -55,8 +55,14 @@ pub struct EnsembleConfig {
     /// dominate the loss. The change of a [flag](crate::env::Feature::flag) is never clipped: its unit is at least
     /// `1 / max_target`.
     pub max_target: f32,
-    /// Whether the reward is learned too; otherwise a known reward function is needed for planning.
+    /// Whether the reward is learned too, by networks of its own; otherwise a known reward function is needed for planning.
     pub learn_reward: bool,
+    /// Width of each hidden layer of the networks that learn the reward.
+    pub reward_hidden: Vec<usize>,
+    /// A learned reward is predicted as symlog(reward / `reward_unit`): where rewards are much larger than the unit, relative
+    /// errors count, below it absolute ones. A small unit tells small rewards apart, such as those far from a goal.
+    #[doc(alias = "symlog")]
+    pub reward_unit: f32,
     /// Whether each predicted change is multiplied by a learned gate, a sigmoid with its own output, which can close over
     /// whole regions of the input: a cube that is not touched stays where it is. Without gates its predicted position
     /// drifts slightly, and planners exploit that.
@@ -83,6 +89,8 @@ impl Default for EnsembleConfig {
             beta: 0.5,
             max_target: 10.0,
             learn_reward: false,
+            reward_hidden: vec![64; 2],
+            reward_unit: 1.0,
             gated: false,
         }
     }
@@ -106,9 +114,13 @@ ranges!(EnsembleConfig {
     beta: 0.0..=1.0,
     max_target: 1e-3..=1e6,
     learn_reward: Any,
+    reward_hidden: 1..=4096,
+    reward_unit: 1e-9..=1e9,
     gated: Any,
 }
 require elites <= members => "`elites` must not exceed `members`";
+require fits(&[*members, weights_between(reward_hidden)]) =>
+    "`members` with the layers of `reward_hidden` have too many weights";
 require fits(&[*members, weights_between(hidden)]) => "`members` with the layers of `hidden` have too many weights";
 require fits(&[*members, *batch, hidden.iter().sum()]) => "`members` times `batch` times `hidden` does not fit into memory";
 require fits(&[*members, *batch, *check_every.min(first_steps.max(steps))]) =>

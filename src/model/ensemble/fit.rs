@@ -5,12 +5,11 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 use rayon::prelude::*;
 
+use super::EnsembleConfig;
 use super::data::{Data, Schedule};
-use super::{Ensemble, EnsembleConfig};
+use super::networks::{Learner, Member, Networks};
 use crate::nn::frozen::FrozenMlp;
-use crate::nn::{
-    Activation, Adam, Grad, LogVarianceBounds, Mlp, Tensor3, bounded_nll, ops, parameters_of_fields, values,
-};
+use crate::nn::{Activation, Grad, Tensor3, bounded_nll, ops, values};
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 
@@ -30,6 +29,21 @@ pub struct Fit {
     /// Validation error of each member: mean squared error of its mean, in normalised units (predicting the mean change
     /// has error 1). Empty without validation set.
     pub errors: Vec<f64>,
+    /// The same of the networks that learn the reward; empty if none do.
+    pub reward_errors: Vec<f64>,
+}
+
+/// The rows of the replay buffer to train on, and those held out.
+pub(super) struct Split {
+    pub training: Vec<usize>,
+    pub validation: Vec<usize>,
+}
+
+impl Split {
+    pub fn new(replay: &ReplayBuffer, held_out: f64) -> Self {
+        let (validation, training) = (0..replay.len()).partition(|row| is_held_out(replay.serial(*row), held_out));
+        Self { training, validation }
+    }
 }
 
 /// Whether the transition of this serial number belongs to the validation set: for a share `held_out` of all, once and for
@@ -41,22 +55,6 @@ fn is_held_out(serial: u64, held_out: f64) -> bool {
     let phase = (serial.wrapping_mul(GOLDEN_RATIO) >> 11) as f64 / (1_u64 << 53) as f64;
     phase >= 1.0 - held_out
 }
-
-/// One network of the ensemble with its optimiser. Members share nothing but the data, so they train in parallel.
-#[derive(Clone, Debug)]
-pub(super) struct Member {
-    pub learner: Learner,
-    pub optimiser: Adam,
-}
-
-/// What gradients train: the network, and the bounds of its log-variance. Bounds that are not learned have no gradient.
-#[derive(Clone, Debug)]
-pub(super) struct Learner {
-    pub network: Mlp,
-    pub bounds: LogVarianceBounds,
-}
-
-parameters_of_fields!(Learner: network, bounds);
 
 /// The best weights of a member during a fit. Whether a snapshot is better and whether it is worth going on for are
 /// separate questions: many gains below [`IMPROVEMENT`] add up.
@@ -88,36 +86,25 @@ impl Best {
     }
 }
 
-impl Ensemble {
-    /// Trains on all transitions in `replay`. Weights and optimiser state continue from the fit before; normalisation,
-    /// elites and temperature are computed anew.
-    ///
-    /// # Panics
-    /// If there are fewer than two transitions.
-    #[doc(alias = "negative log-likelihood")]
-    #[doc(alias = "early stopping")]
-    #[doc(alias = "bootstrap")]
-    #[doc(alias = "train")]
-    pub fn fit(&mut self, replay: &ReplayBuffer, rng: &mut Rng) -> Fit {
-        let data = self.normalised(replay);
-        let (validation, training): (Vec<usize>, Vec<usize>) =
-            (0..data.rows).partition(|row| is_held_out(replay.serial(*row), self.config.held_out));
+impl Networks {
+    /// Trains for at most `limit` gradient steps. Weights and optimiser state continue from the fit before; elites and
+    /// temperature are computed anew.
+    pub fn fit(&mut self, config: &EnsembleConfig, data: &Data, split: &Split, limit: usize, rng: &mut Rng) -> Fit {
+        let Split { training, validation } = split;
         let mut schedules: Vec<Schedule> =
-            (0..self.config.members).map(|_| Schedule::new(&training, self.config.bootstrap, rng)).collect();
-
-        let limit = if self.is_fitted() { self.config.steps } else { self.config.first_steps };
-        let mut best: Vec<Best> = (0..self.config.members).map(|_| Best::default()).collect();
+            (0..config.members).map(|_| Schedule::new(training, config.bootstrap, rng)).collect();
+        let mut best: Vec<Best> = (0..config.members).map(|_| Best::default()).collect();
         let (mut steps, mut loss, mut checks_without_improvement) = (0, 0.0, 0);
-        while steps < limit && checks_without_improvement < self.config.patience {
-            let round = steps..limit.min(steps + self.config.check_every);
+        while steps < limit && checks_without_improvement < config.patience {
+            let round = steps..limit.min(steps + config.check_every);
             steps = round.end;
-            let rates: Vec<f32> = round.map(|step| self.config.learning_rate_at(step, limit)).collect();
-            loss += self.train(&data, &mut schedules, &rates, rng);
+            let rates: Vec<f32> = round.map(|step| config.learning_rate_at(step, limit)).collect();
+            loss += self.train(config, data, &mut schedules, &rates, rng);
             if validation.is_empty() {
                 continue;
             }
             let mut improved = false;
-            for ((best, error), member) in best.iter_mut().zip(self.errors(&data, &validation)).zip(&self.members) {
+            for ((best, error), member) in best.iter_mut().zip(self.errors(data, validation)).zip(&self.members) {
                 improved |= best.consider(error, &member.learner);
             }
             checks_without_improvement = if improved { 0 } else { checks_without_improvement + 1 };
@@ -127,31 +114,38 @@ impl Ensemble {
                 member.learner = learner;
             }
         }
-        self.elites = (0..self.config.members).collect();
+        self.elites = (0..config.members).collect();
         self.elites.sort_by(|a, b| best[*a].error.total_cmp(&best[*b].error));
-        self.elites.truncate(self.config.elites);
+        self.elites.truncate(config.elites);
         let errors = best.iter().map(|best| best.error).filter(|error| error.is_finite()).collect();
-        self.fit_temperature(&data, &validation);
-        self.fits += 1;
-        Fit { steps, loss: (loss / (steps.max(1) * self.config.members) as f64) as f32, errors }
+        self.fit_temperature(data, validation);
+        let loss = (loss / (steps.max(1) * config.members) as f64) as f32;
+        Fit { steps, loss, errors, reward_errors: Vec::new() }
     }
 
     /// One gradient step of every member for each learning rate, each member on its own minibatches. Returns the sum of
     /// all losses.
-    fn train(&mut self, data: &Data, schedules: &mut [Schedule], rates: &[f32], rng: &mut Rng) -> f64 {
-        let batch = self.config.batch.min(schedules[0].len());
+    fn train(
+        &mut self,
+        config: &EnsembleConfig,
+        data: &Data,
+        schedules: &mut [Schedule],
+        rates: &[f32],
+        rng: &mut Rng,
+    ) -> f64 {
+        let batch = config.batch.min(schedules[0].len());
         let mut minibatches: Vec<Vec<Vec<usize>>> = vec![vec![]; schedules.len()];
         for _ in rates {
             for (minibatches, schedule) in minibatches.iter_mut().zip(schedules.iter_mut()) {
                 minibatches.push(schedule.next(batch, rng));
             }
         }
-        let config = &self.config;
+        let gated = self.gated;
         let members = self.members.par_iter_mut().zip(minibatches);
         let losses: Vec<f64> = members
             .map(|(member, minibatches)| {
                 let steps = minibatches.iter().zip(rates);
-                steps.map(|(rows, rate)| f64::from(member.gradient_step(data, rows, *rate, config))).sum()
+                steps.map(|(rows, rate)| f64::from(member.gradient_step(data, rows, *rate, gated, config))).sum()
             })
             .collect();
         losses.iter().sum()
@@ -196,15 +190,22 @@ impl Ensemble {
     /// The outputs of each member for some rows, `[rows, 2 outputs]`, and the targets, `[rows, outputs]`.
     fn heads_and_targets(&self, data: &Data, rows: &[usize]) -> (Vec<Vec<f32>>, Vec<f32>) {
         let x = data.inputs_of(rows);
-        let head = |member: &Member| values(&member.learner.head(x.clone(), self.config.gated, Grad::Input)).to_vec();
+        let head = |member: &Member| values(&member.learner.head(x.clone(), self.gated, Grad::Input)).to_vec();
         (self.members.par_iter().map(head).collect(), values(&data.targets_of(rows)).to_vec())
     }
 }
 
 impl Member {
     /// One step of AdamW on a minibatch of rows. Returns the loss.
-    fn gradient_step(&mut self, data: &Data, rows: &[usize], learning_rate: f32, config: &EnsembleConfig) -> f32 {
-        let loss = self.learner.nll(data.inputs_of(rows).leaky_traced(), &data.targets_of(rows), config);
+    fn gradient_step(
+        &mut self,
+        data: &Data,
+        rows: &[usize],
+        learning_rate: f32,
+        gated: bool,
+        config: &EnsembleConfig,
+    ) -> f32 {
+        let loss = self.learner.nll(data.inputs_of(rows).leaky_traced(), &data.targets_of(rows), gated, config);
         let value = values(&loss)[0];
         self.optimiser.set_learning_rate(learning_rate);
         self.optimiser.step(&mut self.learner, &mut loss.sum().backward());
@@ -216,8 +217,14 @@ impl Learner {
     /// The negative log-likelihood of Gaussians with bounded log-variance (Chua et al. 2018, section 4 and appendix A.1),
     /// or its beta-NLL variant: see [`bounded_nll`].
     #[doc(alias = "negative log-likelihood")]
-    fn nll<T: Tape<f32, Cpu>>(&self, x: Tensor3<T>, targets: &Tensor3, config: &EnsembleConfig) -> Tensor3<T> {
-        let head = self.head(x, config.gated, Grad::Params);
+    fn nll<T: Tape<f32, Cpu>>(
+        &self,
+        x: Tensor3<T>,
+        targets: &Tensor3,
+        gated: bool,
+        config: &EnsembleConfig,
+    ) -> Tensor3<T> {
+        let head = self.head(x, gated, Grad::Params);
         let grad = if config.learn_bounds { Grad::Both } else { Grad::Input };
         bounded_nll(head, targets, &self.bounds, config.beta, grad)
     }

@@ -1,9 +1,9 @@
 //! Probabilistic ensembles (Chua et al. 2018, PETS, section 4): several networks, each of which predicts a Gaussian over
 //! the change of the observation in one time step.
 //!
-//! For an observation and an action each network outputs mean and log-variance of the *change* of the observation, and of
-//! the reward if that is learned. The variance that members predict is aleatoric uncertainty (noise of the environment);
-//! their disagreement is epistemic uncertainty (too few data).
+//! For an observation and an action each network outputs mean and log-variance of the *change* of the observation. The
+//! variance that members predict is aleatoric uncertainty (noise of the environment); their disagreement is epistemic
+//! uncertainty (too few data). A reward that is not known is learned by networks of its own ([`LearnedReward`]).
 //!
 //! Deviations from PETS:
 //! - Targets are normalised as well as inputs, because features differ in scale (a cube moves by millimetres per time
@@ -48,18 +48,27 @@
 mod config;
 mod data;
 mod fit;
+mod networks;
+mod reward;
 
 pub use config::EnsembleConfig;
 pub use fit::Fit;
+pub use reward::LearnedReward;
 
-use self::fit::{Learner, Member};
-use super::{Dynamics, FeatureMap, Normaliser};
+use self::data::Data;
+use self::fit::Split;
+use self::networks::Networks;
+use self::reward::RewardModel;
+use super::{Dynamics, FeatureMap};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::env::Spec;
 use crate::error::Result;
-use crate::nn::{Activation, Adam, AdamConfig, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, device};
+use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 use crate::settings::Ranges;
+
+/// Floor of a normaliser's standard deviations, as a fraction of the feature's scale.
+const MIN_STD: f32 = 1e-3;
 
 /// A probabilistic ensemble in training: networks, optimisers and normalisation. [`Ensemble::dynamics`] is the snapshot
 /// that predicts.
@@ -75,12 +84,9 @@ pub struct Ensemble {
     /// Whether each feature of an observation is a flag.
     flags: Vec<bool>,
     actions: usize,
-    members: Vec<Member>,
-    inputs: Normaliser,
-    targets: Normaliser,
-    /// Factor of the predicted standard deviation of each output, fitted on the validation set.
-    temperature: Vec<f32>,
-    elites: Vec<usize>,
+    networks: Networks,
+    /// Learns the reward, if it is not known.
+    reward: Option<RewardModel>,
     fits: usize,
 }
 
@@ -92,36 +98,15 @@ impl Ensemble {
     /// [`FeatureMap::new`].
     pub fn new(spec: &Spec, config: EnsembleConfig, rng: &mut Rng) -> Result<Self> {
         config.check_at("ensemble")?;
-        let cpu = device();
         let (features, actions) = (FeatureMap::new(spec)?, spec.action_size);
-        let features = if config.learn_reward { features.with_goals(spec) } else { features };
-        let inputs = features.input_size() + actions;
-        let outputs = features.predicted.len() + usize::from(config.learn_reward);
-        let shape = MlpConfig {
-            members: config.members,
-            input: inputs,
-            hidden: config.hidden.clone(),
-            output: Some(if config.gated { 3 } else { 2 } * outputs),
-            norm: Norm::None,
-            activation: Activation::Silu,
-            init: Init::TruncatedNormal,
-        };
-        let networks = Mlp::new(&cpu, &shape, rng);
-        let optimiser = AdamConfig { weight_decay: config.weight_decay, ..AdamConfig::new(config.learning_rate) };
-        let member = |i: usize| {
-            let bounds = LogVarianceBounds::new(&cpu, outputs);
-            Member { learner: Learner { network: networks.member(&cpu, i), bounds }, optimiser: Adam::new(optimiser) }
-        };
+        let (inputs, outputs) = (features.input_size() + actions, features.predicted.len());
         Ok(Self {
             features,
             scales: spec.observation.iter().map(|feature| feature.scale).collect(),
             flags: spec.observation.iter().map(|feature| feature.flag).collect(),
             actions,
-            members: (0..config.members).map(member).collect(),
-            inputs: Normaliser::identity(inputs),
-            targets: Normaliser::identity(outputs),
-            temperature: vec![1.0; outputs],
-            elites: (0..config.elites).collect(),
+            networks: Networks::new(&config, [inputs, outputs], &config.hidden, config.gated, rng),
+            reward: config.learn_reward.then(|| RewardModel::new(spec, &config, rng)),
             fits: 0,
             config,
         })
@@ -132,29 +117,68 @@ impl Ensemble {
         self.fits > 0
     }
 
+    /// Trains on all transitions in `replay`. Weights and optimiser state continue from the fit before; normalisation,
+    /// elites and temperature are computed anew.
+    ///
+    /// # Panics
+    /// If there are fewer than two transitions.
+    #[doc(alias = "negative log-likelihood")]
+    #[doc(alias = "early stopping")]
+    #[doc(alias = "bootstrap")]
+    #[doc(alias = "train")]
+    pub fn fit(&mut self, replay: &ReplayBuffer, rng: &mut Rng) -> Fit {
+        assert!(replay.len() >= 2, "an ensemble learns from at least two transitions");
+        let limit = if self.is_fitted() { self.config.steps } else { self.config.first_steps };
+        let split = Split::new(replay, self.config.held_out);
+        let data = self.normalised(replay);
+        let mut fit = self.networks.fit(&self.config, &data, &split, limit, rng);
+        if let Some(reward) = &mut self.reward {
+            fit.reward_errors = reward.fit(&self.config, replay, &split, limit, rng).errors;
+        }
+        self.fits += 1;
+        fit
+    }
+
+    /// All transitions as inputs (observation features and action) and targets (changes of the predicted features).
+    fn normalised(&mut self, replay: &ReplayBuffer) -> Data {
+        let (mut inputs, mut targets) = (Vec::new(), Vec::new());
+        for i in 0..replay.len() {
+            let row = replay.row(i);
+            let (mut obs, mut next_obs) = (row.obs.to_vec(), row.next_obs.to_vec());
+            self.features.canonicalize(&mut obs, Some(&mut next_obs));
+            inputs.extend(self.features.inputs(&obs).chain(row.action.iter().copied()));
+            targets.extend(self.features.predicted.iter().map(|i| next_obs[*i] - obs[*i]));
+        }
+        let floor = |i: &usize| MIN_STD * self.scales[*i];
+        let unscaled = vec![MIN_STD; self.features.near.len() + self.actions];
+        let input_floors: Vec<f32> = self.features.raw.iter().map(floor).chain(unscaled).collect();
+        // A flag that flips in a share f of all steps changes by 1/sqrt(f) standard deviations: clipped, the flip of a rare
+        // one would be predicted too small to be noticed. With this floor no flip exceeds the clip.
+        let flip = 1.0 / self.config.max_target;
+        let target_floor = |i: &usize| if self.flags[*i] { floor(i).max(flip) } else { floor(i) };
+        let target_floors: Vec<f32> = self.features.predicted.iter().map(target_floor).collect();
+        Data::new(&mut self.networks, [inputs, targets], [&input_floors, &target_floors], self.config.max_target)
+    }
+
     /// The elites as a model to predict and plan with: a snapshot, which later fits do not change.
     pub fn dynamics(&self) -> Dynamics {
+        let Networks { members, inputs, targets, temperature, elites, .. } = &self.networks;
         Dynamics::new(
-            self.elites.iter().map(|&member| self.members[member].learner.frozen()),
+            elites.iter().map(|&member| members[member].learner.frozen()),
             self.features.clone(),
             self.actions,
-            self.inputs.clone(),
-            self.targets.clone(),
-            self.temperature.clone(),
+            inputs.clone(),
+            targets.clone(),
+            temperature.clone(),
         )
+        .with_reward(self.reward.as_ref().map(RewardModel::learned))
     }
 
     /// Everything that predictions depend on.
     pub fn weights(&self) -> Weights {
         let mut weights = Weights::default();
-        for (i, member) in self.members.iter().enumerate() {
-            weights.insert_module(&member_name(i), &member.learner);
-        }
-        self.inputs.save(&mut weights, "inputs");
-        self.targets.save(&mut weights, "targets");
-        weights.insert("temperature", self.temperature.clone(), [1, 1, self.temperature.len()]);
-        let elites: Vec<u64> = self.elites.iter().map(|member| *member as u64).collect();
-        weights.insert_counts("elites", &elites);
+        self.networks.save(&mut weights, "");
+        self.reward.iter().for_each(|reward| reward.save(&mut weights));
         weights.insert_counts("fits", &[self.fits as u64]);
         weights
     }
@@ -164,31 +188,21 @@ impl Ensemble {
     /// # Errors
     /// If an array is missing or has another shape, as with other settings, or a number is none that was saved.
     pub fn load_weights(&mut self, weights: &Weights) -> Result<()> {
-        let last = self.config.members as u64 - 1;
-        let elites = weights.counts_within("elites", &vec![0..=last; self.config.elites])?;
-        let temperature =
-            weights.get_within("temperature", [1, 1, self.temperature.len()], f32::MIN_POSITIVE..=f32::MAX)?.to_vec();
+        self.networks.load(weights, "")?;
+        self.reward.iter_mut().try_for_each(|reward| reward.load(weights))?;
         self.fits = weights.count("fits", 0..=MAX_COUNT)? as usize;
-        for (i, member) in self.members.iter_mut().enumerate() {
-            weights.load_module(&member_name(i), &mut member.learner)?;
-        }
-        self.inputs.load(weights, "inputs")?;
-        self.targets.load(weights, "targets")?;
-        self.elites = elites.into_iter().map(|member| member as usize).collect();
-        self.temperature = temperature;
         Ok(())
     }
 
     /// Gradient steps so far, of the member that has made most.
     pub fn updates(&self) -> u64 {
-        self.members.iter().map(|member| member.optimiser.steps()).max().unwrap_or(0)
+        self.networks.members.iter().map(|member| member.optimiser.steps()).max().unwrap_or(0)
     }
 
     /// Adds the state of the optimisers to `state`.
     pub fn save_training_state(&self, state: &mut Weights) {
-        for (i, member) in self.members.iter().enumerate() {
-            member.optimiser.save(state, &member_name(i));
-        }
+        self.networks.save_training_state(state, "");
+        self.reward.iter().for_each(|reward| reward.save_training_state(state));
     }
 
     /// Loads what [`Ensemble::save_training_state`] stored.
@@ -196,14 +210,7 @@ impl Ensemble {
     /// # Errors
     /// If an array is missing or has another shape.
     pub fn load_training_state(&mut self, state: &Weights) -> Result<()> {
-        for (i, member) in self.members.iter_mut().enumerate() {
-            member.optimiser.load(state, &member_name(i), &member.learner)?;
-        }
-        Ok(())
+        self.networks.load_training_state(state, "")?;
+        self.reward.iter_mut().try_for_each(|reward| reward.load_training_state(state))
     }
-}
-
-/// Prefix of a member's arrays in a checkpoint.
-fn member_name(member: usize) -> String {
-    format!("ensemble.{member}")
 }

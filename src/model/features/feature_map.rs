@@ -16,8 +16,7 @@ pub(super) const NEAR: f32 = 4.0;
 pub struct FeatureMap {
     /// Features in an observation.
     pub width: usize,
-    /// Features that networks read: those of [`Role::Dynamic`], and the differences of two such; with
-    /// [`FeatureMap::with_goals`] all features.
+    /// Features that networks read: those of [`Role::Dynamic`], and the differences of two such.
     pub raw: Vec<usize>,
     /// Features that networks read a second time as `tanh(factor x)`, each with its factor: the differences among `raw`.
     /// The tanh magnifies values near zero, where millimetres decide whether the hand touches an object.
@@ -69,21 +68,6 @@ impl FeatureMap {
         }
         let cubes = Cube::find(spec, &predicted);
         Ok(Self { width: features.len(), raw, near, predicted, differences, cubes })
-    }
-
-    /// The same map, whose networks also read constant features and the differences from them: a reward depends on the
-    /// goal, although the dynamics do not.
-    #[must_use]
-    pub fn with_goals(mut self, spec: &Spec) -> Self {
-        for (i, feature) in spec.observation.iter().enumerate() {
-            if !self.raw.contains(&i) {
-                self.raw.push(i);
-                if let Role::Difference { .. } = feature.role {
-                    self.near.push((i, NEAR / feature.scale));
-                }
-            }
-        }
-        self
     }
 
     /// Network inputs per observation.

@@ -63,20 +63,32 @@ impl LatentFeatures {
         self.raw.len() + self.near.len()
     }
 
+    /// Features in an observation.
+    pub fn observation_size(&self) -> usize {
+        self.centre.len()
+    }
+
     /// Encoder inputs of observations (`[rows, observation]`, physical units): `[1, rows, width]`.
     pub fn encode(&self, cpu: &Cpu, obs: &[f32]) -> Tensor3 {
-        let size = self.centre.len();
-        let mut inputs = Vec::with_capacity(obs.len());
-        let mut row = Vec::with_capacity(size);
-        for obs in obs.chunks_exact(size) {
-            row.clear();
-            row.extend_from_slice(obs);
-            self.cubes.iter().for_each(|cube| cube.apply(cube.to_canonical(obs), &mut row));
-            let scaled = |i: &usize| (row[*i] - self.centre[*i]) / self.scale[*i];
-            inputs.extend(self.raw.iter().map(|i| symlog(scaled(i))));
-            inputs.extend(self.near.iter().map(|i| tanh(NEAR * scaled(i))));
-        }
-        tensor(cpu, inputs, (1, obs.len() / size, self.width()))
+        let rows = obs.len() / self.observation_size();
+        let mut inputs = Vec::with_capacity(rows * self.width());
+        obs.chunks_exact(self.observation_size()).for_each(|obs| self.push(obs, &mut inputs));
+        tensor(cpu, inputs, (1, rows, self.width()))
+    }
+
+    /// Appends the encoder inputs of one observation.
+    pub(crate) fn push(&self, obs: &[f32], inputs: &mut Vec<f32>) {
+        let mut canonical = Vec::new();
+        let obs = if self.cubes.is_empty() {
+            obs
+        } else {
+            canonical.extend_from_slice(obs);
+            self.cubes.iter().for_each(|cube| cube.apply(cube.to_canonical(obs), &mut canonical));
+            &canonical
+        };
+        let scaled = |i: &usize| (obs[*i] - self.centre[*i]) / self.scale[*i];
+        inputs.extend(self.raw.iter().map(|i| symlog(scaled(i))));
+        inputs.extend(self.near.iter().map(|i| tanh(NEAR * scaled(i))));
     }
 
     /// Observations (`[rows, observation]`, physical units) of decoder outputs, `[1, rows, width]`.

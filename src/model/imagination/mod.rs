@@ -58,6 +58,9 @@ use crate::env::KnownReward;
 use crate::nn::frozen::PANEL;
 use crate::rng::Rng;
 
+/// What is wrong if a model has to predict rewards that it has not learned.
+pub(super) const NO_REWARD: &str = "`Reward::Learned` needs a model that has learned rewards";
+
 /// Rows that one thread puts through a network at a time: few enough for its cache.
 const ROWS: usize = 12 * PANEL;
 
@@ -95,7 +98,7 @@ pub enum Propagation {
 pub enum Reward<'a> {
     /// A known function of observations and action, which also says when the task terminates.
     Known(&'a (dyn KnownReward + Sync)),
-    /// The model's own prediction. Trajectories never terminate then.
+    /// What the model has learned of them, [`Dynamics::learned_reward`]. Trajectories never terminate then.
     Learned,
 }
 
@@ -108,8 +111,8 @@ impl std::fmt::Debug for Reward<'_> {
     }
 }
 
-/// A terminal value function: the value of an observation, in units of return.
-pub type Value<'a> = dyn Fn(&[f32]) -> f32 + Sync + 'a;
+/// A terminal value function: writes the value of each observation (`[rows, observation]`), in units of return.
+pub type Value<'a> = dyn Fn(&[f32], &mut [f32]) + Sync + 'a;
 
 /// Rollouts of a model.
 #[doc(alias = "rollout")]

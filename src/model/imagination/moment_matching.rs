@@ -62,9 +62,6 @@ impl Rollout<'_> {
                 variance += moments.epistemic(j) / (typical * typical);
             }
             dynamics.features.recompute_derived(next);
-            if outputs > predicted.len() {
-                self.rewards[row] = drawn(row * outputs + predicted.len());
-            }
             self.disagreement[row % candidates] += (variance / predicted.len() as f32).sqrt() / particles as f32;
         }
     }

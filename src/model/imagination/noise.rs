@@ -2,7 +2,7 @@
 
 use rand::seq::SliceRandom;
 
-use super::{Imagination, Propagation, Reward};
+use super::{Imagination, Propagation};
 use crate::rng::{self, Rng};
 
 /// All random numbers of a rollout, shared by all candidates. Since all candidates see the same noise, differences between
@@ -29,12 +29,8 @@ pub(super) struct StepNoise<'a> {
 
 impl CommonRandomNumbers {
     pub fn draw(imagination: &Imagination, horizon: usize, rng: &mut Rng) -> Self {
-        let Imagination { dynamics, reward, propagation, .. } = *imagination;
+        let Imagination { dynamics, propagation, .. } = *imagination;
         let particles = imagination.particles();
-        assert!(
-            !matches!(reward, Reward::Learned) || dynamics.predicts_reward(),
-            "`Reward::Learned` needs a model that has learned rewards"
-        );
         let draws = match propagation {
             Propagation::TsInf | Propagation::Ts1 => {
                 assert!(particles.is_multiple_of(dynamics.members()), "particles: a multiple of the members");

@@ -1,8 +1,10 @@
 //! The loop over time steps: one rollout of several candidates on one thread.
 
 use super::noise::CommonRandomNumbers;
-use super::{Imagination, Propagation, Reward};
+use super::{Imagination, NO_REWARD, Propagation, Reward};
+use crate::env::KnownReward;
 use crate::model::dynamics::Scratch;
+use crate::model::ensemble::LearnedReward;
 
 /// Candidates in imagination, with the buffers of one time step. A row is one particle of one candidate; rows are ordered
 /// `[particles, candidates]`.
@@ -81,11 +83,12 @@ impl<'a> Rollout<'a> {
         self.add_terminal_values();
     }
 
-    /// Adds the rewards of the time step from `states` to `next`.
+    /// Adds the rewards of the time step from `states` to `next` to the returns.
     fn add_rewards(&mut self) {
         let Imagination { dynamics, reward, .. } = *self.imagination;
-        if let Reward::Known(known) = reward {
-            known.rewards(&self.states, &self.actions, &self.next, &mut self.rewards);
+        match reward {
+            Reward::Known(known) => known.rewards(&self.states, &self.actions, &self.next, &mut self.rewards),
+            Reward::Learned => self.learned_rewards(dynamics.learned_reward().expect(NO_REWARD)),
         }
         let width = dynamics.observation_size();
         for (row, (reward_of_row, alive)) in self.rewards.iter().zip(&mut self.alive).enumerate() {
@@ -98,12 +101,35 @@ impl<'a> Rollout<'a> {
         }
     }
 
+    /// The rewards of the time step as the model has learned them. Each particle keeps to one member, so that the mean over
+    /// particles is that over members; a single particle gets the latter.
+    fn learned_rewards(&mut self, learned: &LearnedReward) {
+        if self.particles == 1 {
+            return learned.rewards(&self.states, &self.actions, &self.next, &mut self.rewards);
+        }
+        let dynamics = self.imagination.dynamics;
+        let (width, actions) = (dynamics.observation_size(), dynamics.action_size());
+        for p in 0..self.particles {
+            let rows = p * self.candidates..(p + 1) * self.candidates;
+            let of = |width: usize| rows.start * width..rows.end * width;
+            learned.of_member(
+                p * learned.members() / self.particles,
+                &self.states[of(width)],
+                &self.actions[of(actions)],
+                &self.next[of(width)],
+                &mut self.rewards[rows.clone()],
+            );
+        }
+    }
+
     /// Adds the value of the last observations where the task has not terminated.
     fn add_terminal_values(&mut self) {
         let Some(value) = self.imagination.value else { return };
-        for (row, state) in self.states.chunks_exact(self.imagination.dynamics.observation_size()).enumerate() {
+        let mut values = vec![0.0; self.alive.len()];
+        value(&self.states, &mut values);
+        for (row, value) in values.into_iter().enumerate() {
             if self.alive[row] {
-                self.returns[row % self.candidates * self.particles + row / self.candidates] += value(state);
+                self.returns[row % self.candidates * self.particles + row / self.candidates] += value;
             }
         }
     }

@@ -82,7 +82,7 @@ fn the_std_of_noise_grows_with_the_root_of_time() {
 #[test]
 fn no_reward_counts_after_termination() {
     let dynamics = disagreeing(0.0, 1e-8);
-    let value = |_: &[f32]| 100.0;
+    let value = |_: &[f32], values: &mut [f32]| values.fill(100.0);
     let mut imagination = imagine(&dynamics, Propagation::TsInf, 2);
     imagination.value = Some(&value);
     let imagined =

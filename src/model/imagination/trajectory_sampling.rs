@@ -19,7 +19,6 @@ impl Rollout<'_> {
         let dynamics = self.imagination.dynamics;
         let (width, outputs, candidates) = (dynamics.observation_size(), dynamics.outputs(), self.candidates);
         let predicted = &dynamics.features.predicted;
-        let reward_output = dynamics.predicts_reward().then_some(predicted.len());
         let particles_per_member = self.particles / dynamics.members();
         for (member, particles) in noise.order.chunks_exact(particles_per_member).enumerate() {
             let distinct = if first { &particles[..1] } else { particles };
@@ -29,16 +28,12 @@ impl Rollout<'_> {
                 let noise = &noise.noise[p * outputs..][..outputs];
                 let rows = p * candidates * width..(p + 1) * candidates * width;
                 let rows = self.states[rows.clone()].chunks_exact(width).zip(self.next[rows].chunks_exact_mut(width));
-                let rewards = &mut self.rewards[p * candidates..][..candidates];
-                for ((head, (state, next)), reward) in head.chunks_exact(2 * outputs).zip(rows).zip(rewards) {
+                for (head, (state, next)) in head.chunks_exact(2 * outputs).zip(rows) {
                     let (change, std) = head.split_at(outputs);
                     let drawn = change.iter().zip(std).zip(noise).map(|((c, s), n)| c + s * n);
                     next.copy_from_slice(state);
                     predicted.iter().zip(drawn).for_each(|(i, drawn)| next[*i] += drawn);
                     dynamics.features.recompute_derived(next);
-                    if let Some(i) = reward_output {
-                        *reward = change[i] + std[i] * noise[i];
-                    }
                 }
             }
         }

@@ -1,0 +1,189 @@
+//! The reward, learned by networks of its own.
+//!
+//! A reward is a function of the transition, so its networks read observation, action and next observation, observations as
+//! [`LatentFeatures`]: displacements instead of goals, because a few hundred episodes contain only a few hundred goals. They
+//! share no weights with the networks of the dynamics, whose error would grow with that of the reward. There is one for each
+//! member of the ensemble, all learn from the same transitions, each in its own order.
+
+use super::data::Data;
+use super::fit::{Fit, Split};
+use super::networks::Networks;
+use super::{EnsembleConfig, MIN_STD};
+use crate::checkpoint::Weights;
+use crate::env::{KnownReward, Spec};
+use crate::error::Result;
+use crate::model::{LatentFeatures, Normaliser};
+use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
+use crate::nn::two_hot::{symexp, symlog};
+use crate::replay::ReplayBuffer;
+use crate::rng::Rng;
+
+/// Prefix of its arrays in a checkpoint.
+const NAME: &str = "reward.";
+
+/// The networks in training.
+#[derive(Clone, Debug)]
+pub(super) struct RewardModel {
+    networks: Networks,
+    inputs: Inputs,
+    /// [`EnsembleConfig::reward_unit`]
+    unit: f32,
+    /// The smallest and the largest reward that it has learned from, as the networks predict them.
+    range: [f32; 2],
+}
+
+impl RewardModel {
+    pub fn new(spec: &Spec, config: &EnsembleConfig, rng: &mut Rng) -> Self {
+        let inputs = Inputs { features: LatentFeatures::new(spec), actions: spec.action_size };
+        let networks = Networks::new(config, [inputs.width(), 1], &config.reward_hidden, false, rng);
+        Self { networks, inputs, unit: config.reward_unit, range: [0.0; 2] }
+    }
+
+    pub fn fit(
+        &mut self,
+        config: &EnsembleConfig,
+        replay: &ReplayBuffer,
+        split: &Split,
+        limit: usize,
+        rng: &mut Rng,
+    ) -> Fit {
+        let (mut inputs, mut targets) = (Vec::new(), Vec::with_capacity(replay.len()));
+        for i in 0..replay.len() {
+            let row = replay.row(i);
+            self.inputs.push([row.obs, row.action, row.next_obs], &mut inputs);
+            targets.push(symlog(row.reward / self.unit));
+        }
+        self.range = targets
+            .iter()
+            .fold([f32::INFINITY, f32::NEG_INFINITY], |[low, high], target| [low.min(*target), high.max(*target)]);
+        let floors = vec![MIN_STD; self.inputs.width()];
+        let data = Data::new(&mut self.networks, [inputs, targets], [&floors, &[MIN_STD]], config.max_target);
+        self.networks.fit(config, &data, split, limit, rng)
+    }
+
+    /// A snapshot of the elites.
+    pub fn learned(&self) -> LearnedReward {
+        let Networks { members, inputs, targets, elites, .. } = &self.networks;
+        LearnedReward {
+            members: elites.iter().map(|&member| members[member].learner.frozen().0).collect(),
+            inputs: self.inputs.clone(),
+            normaliser: inputs.clone(),
+            mean: targets.mean[0],
+            scale: targets.scale[0],
+            unit: self.unit,
+            range: self.range,
+        }
+    }
+
+    pub fn save(&self, weights: &mut Weights) {
+        self.networks.save(weights, NAME);
+        weights.insert(format!("{NAME}range"), self.range.to_vec(), [1, 1, 2]);
+    }
+
+    pub fn load(&mut self, weights: &Weights) -> Result<()> {
+        let range = weights.get(&format!("{NAME}range"), [1, 1, 2])?;
+        let range = [range[0].min(range[1]), range[0].max(range[1])];
+        self.networks.load(weights, NAME)?;
+        self.range = range;
+        Ok(())
+    }
+
+    pub fn save_training_state(&self, state: &mut Weights) {
+        self.networks.save_training_state(state, NAME);
+    }
+
+    pub fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        self.networks.load_training_state(state, NAME)
+    }
+}
+
+/// What the networks read.
+#[derive(Clone, Debug)]
+struct Inputs {
+    features: LatentFeatures,
+    actions: usize,
+}
+
+impl Inputs {
+    fn width(&self) -> usize {
+        2 * self.features.width() + self.actions
+    }
+
+    /// Appends the inputs of a transition: observation, action, next observation.
+    fn push(&self, [obs, action, next_obs]: [&[f32]; 3], inputs: &mut Vec<f32>) {
+        self.features.push(obs, inputs);
+        inputs.extend_from_slice(action);
+        self.features.push(next_obs, inputs);
+    }
+}
+
+/// A learned reward function with fixed weights.
+///
+/// As a [`KnownReward`] it gives the mean of its members. Predictions stay within the rewards that it has learned from, so
+/// that a planner finds none that is better than all that were received.
+#[doc(alias = "reward model")]
+#[derive(Clone, Debug)]
+pub struct LearnedReward {
+    members: Vec<FrozenMlp>,
+    inputs: Inputs,
+    normaliser: Normaliser,
+    mean: f32,
+    scale: f32,
+    unit: f32,
+    range: [f32; 2],
+}
+
+impl LearnedReward {
+    /// Number of members.
+    pub fn members(&self) -> usize {
+        self.members.len()
+    }
+
+    /// The rewards of transitions as one member predicts them: `obs` and `next_obs` hold `rewards.len()` rows, one after the
+    /// other, as does `actions`.
+    ///
+    /// # Panics
+    /// If the lengths do not fit together, or there is no such member.
+    pub fn of_member(&self, member: usize, obs: &[f32], actions: &[f32], next_obs: &[f32], rewards: &mut [f32]) {
+        let (network, width) = (&self.members[member], self.inputs.width());
+        let observation = self.inputs.features.observation_size();
+        let rows = obs
+            .chunks_exact(observation)
+            .zip(actions.chunks_exact(self.inputs.actions))
+            .zip(next_obs.chunks_exact(observation));
+        assert_eq!(rows.len(), rewards.len(), "one reward for each transition");
+        let rows: Vec<_> = rows.map(|((obs, action), next_obs)| [obs, action, next_obs]).collect();
+        let (mut panels, mut inputs) = (Panels::default(), Vec::with_capacity(width));
+        for (rows, rewards) in rows.chunks(PANEL).zip(rewards.chunks_mut(PANEL)) {
+            let x = panels.input(width);
+            for (place, row) in rows.iter().enumerate() {
+                inputs.clear();
+                self.inputs.push(*row, &mut inputs);
+                x.iter_mut().zip(&inputs).for_each(|(x, input)| x.0[place] = *input);
+            }
+            self.normaliser.normalise_panel(x);
+            let y = &network.forward(&mut panels)[0];
+            for (reward, y) in rewards.iter_mut().zip(&y.0) {
+                *reward = self.unit * symexp((self.mean + self.scale * y).clamp(self.range[0], self.range[1]));
+            }
+        }
+    }
+}
+
+impl KnownReward for LearnedReward {
+    fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32 {
+        let mut reward = [0.0];
+        self.rewards(obs, action, next_obs, &mut reward);
+        reward[0]
+    }
+
+    fn rewards(&self, obs: &[f32], actions: &[f32], next_obs: &[f32], rewards: &mut [f32]) {
+        let mut of_member = vec![0.0; rewards.len()];
+        rewards.fill(0.0);
+        for member in 0..self.members() {
+            self.of_member(member, obs, actions, next_obs, &mut of_member);
+            let share = 1.0 / self.members() as f32;
+            rewards.iter_mut().zip(&of_member).for_each(|(mean, reward)| *mean += share * reward);
+        }
+    }
+}
