@@ -206,7 +206,7 @@ fn studies_are_joined() {
     let other = read("second/runs.csv").replace("evaluate_every = ", "evaluate_every = 7");
     std::fs::write(here.join("second/runs.csv"), other).expect("a writable table");
     assert!(join(&["first", "second"], "mixed").status.success());
-    assert!(read("mixed/left_out.csv").contains("another configuration (its `evaluate_every` is "));
+    assert!(read("mixed/left_out.csv").contains("another configuration than with seed 0 (its `evaluate_every` is "));
 
     refused(here, &["report", "--from", "first", "--from", "second"], &["several studies", "--out"]);
     refused(here, &["report", "--from", "first", "--from", "whole", "--out", "whole"], &["whole", "joined", "--out"]);

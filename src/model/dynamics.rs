@@ -5,9 +5,9 @@ use dfdx::tensor::Cpu;
 use super::ensemble::LearnedReward;
 use super::uncertainty::split;
 use super::{FeatureMap, Normaliser};
-use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
-use crate::nn::kernels::vectorised_fn;
-use crate::nn::{Activation, Mlp, bounded_variance, ops};
+use crate::nn::frozen::{Feature, FrozenMlp, PANEL, Panels};
+use crate::nn::kernels::{sigmoid, tanh, vectorised_fn};
+use crate::nn::{Activation, Mlp, bounded_variance};
 
 /// The elites of an [`Ensemble`](super::Ensemble) with fixed weights. Observations, changes and variances are in physical
 /// units, those of [`crate::env::Feature`].
@@ -170,19 +170,17 @@ impl Dynamics {
                     self.features.canonicalize(canonical, None);
                     state = canonical;
                 }
-                let inputs = self.features.inputs(state).chain(action.iter().copied());
+                let inputs = self.features.linear_inputs(state).chain(action.iter().copied());
                 x.iter_mut().zip(inputs).for_each(|(x, value)| x.0[place] = value);
             }
+            tanh_panel(&mut x[self.features.raw.len()..][..self.features.near.len()]);
             self.inputs.normalise_panel(x);
             let y = network.forward(panels);
-            (0..rows.len()).for_each(|place| heads.extend(y.iter().map(|y| y.0[place])));
+            let Normaliser { mean, scale } = &self.targets;
+            let [precision, variance] = &self.floors[member];
+            denormalise(y, mean, scale, precision, variance, &self.temperature);
+            (0..rows.len()).for_each(|place| heads.extend(y[..2 * self.outputs()].iter().map(|y| y.0[place])));
         }
-        if self.gated() {
-            ops::gate_rows(heads, self.outputs());
-        }
-        let Normaliser { mean, scale } = &self.targets;
-        let [precision, variance] = &self.floors[member];
-        denormalise(heads, mean, scale, precision, variance, &self.temperature);
         if !self.features.cubes.is_empty() {
             for (&row, head) in batch.iter().zip(heads.chunks_exact_mut(2 * self.outputs())) {
                 let (changes, stds) = head.split_at_mut(self.outputs());
@@ -194,9 +192,10 @@ impl Dynamics {
 }
 
 vectorised_fn! {
-    /// Takes normalised means to changes, and raw log-variances to standard deviations, both in physical units.
+    /// Takes normalised means to changes, through their gates if there are any, and raw log-variances to standard deviations,
+    /// both in physical units.
     fn denormalise(
-        head: &'a mut [f32],
+        y: &'a mut [Feature],
         mean: &'a [f32],
         scale: &'a [f32],
         min_precision: &'a [f32],
@@ -204,15 +203,23 @@ vectorised_fn! {
         temperature: &'a [f32],
     ) {
         let n = mean.len();
-        let (precision, variance) = (&min_precision[..n], &min_variance[..n]);
-        let (scale, temperature) = (&scale[..n], &temperature[..n]);
-        for row in head.chunks_exact_mut(2 * n) {
-            let (means, raw) = row.split_at_mut(n);
-            let raw = &mut raw[..n];
-            for i in 0..n {
-                means[i] = means[i].mul_add(scale[i], mean[i]);
-                raw[i] = bounded_variance(raw[i], precision[i], variance[i]).sqrt() * temperature[i] * scale[i];
+        let (means, rest) = y.split_at_mut(n);
+        let (stds, gates) = rest.split_at_mut(n);
+        for i in 0..n {
+            let (Feature(mean_of_rows), Feature(std)) = (&mut means[i], &mut stds[i]);
+            if let Some(Feature(gate)) = gates.get(i) {
+                (0..PANEL).for_each(|row| mean_of_rows[row] *= sigmoid(gate[row]));
             }
+            let (mean, scale, factor) = (mean[i], scale[i], temperature[i]);
+            mean_of_rows.iter_mut().for_each(|x| *x = x.mul_add(scale, mean));
+            let (precision, variance) = (min_precision[i], min_variance[i]);
+            std.iter_mut().for_each(|x| *x = bounded_variance(*x, precision, variance).sqrt() * factor * scale);
         }
+    }
+}
+
+vectorised_fn! {
+    fn tanh_panel(x: &'a mut [Feature]) {
+        x.iter_mut().for_each(|Feature(x)| x.iter_mut().for_each(|x| *x = tanh(*x)));
     }
 }

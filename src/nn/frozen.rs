@@ -101,8 +101,8 @@ impl FrozenMlp {
         self.layers.iter().map(|layer| (layer.weight(), layer.bias.as_flattened()[..layer.output].to_vec()))
     }
 
-    /// The network's output for the [input](Panels::input).
-    pub fn forward<'a>(&self, panels: &'a mut Panels) -> &'a [Feature] {
+    /// The network's output for the [input](Panels::input). It may be overwritten.
+    pub fn forward<'a>(&self, panels: &'a mut Panels) -> &'a mut [Feature] {
         let Panels { x, y } = panels;
         for (i, layer) in self.layers.iter().enumerate() {
             if i > 0 {
@@ -110,7 +110,7 @@ impl FrozenMlp {
             }
             layer.forward(x, y);
         }
-        &y[..self.outputs()]
+        &mut y[..self.outputs()]
     }
 }
 

@@ -290,7 +290,7 @@ pub fn gated<T: Tape<f32, Cpu>>(x: Tensor3<T>) -> Tensor3<T> {
 }
 
 /// The same for plain rows, in place: `3 n` numbers each become `2 n`.
-pub fn gate_rows(rows: &mut Vec<f32>, n: usize) {
+fn gate_rows(rows: &mut Vec<f32>, n: usize) {
     let count = rows.len() / (3 * n);
     for row in 0..count {
         // What is read has not been written over yet: rows only move towards the front.

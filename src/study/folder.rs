@@ -60,7 +60,7 @@ impl RunFolder {
         let folder = Self { path: path.into(), _lock: lock(path)? };
         let file = path.join(CONFIG);
         if file.exists() {
-            if let Some(difference) = difference(&RunConfig::read(&file)?, config) {
+            if let Some(difference) = difference(&RunConfig::read(&file)?.to_table(), &config.to_table()) {
                 return Err(Error::Config(format!(
                     "{}: this folder holds another run ({difference}); choose another --out, or remove it",
                     file.display()
@@ -229,7 +229,7 @@ fn read_own(path: &Path, config: &RunConfig) -> Result<Weights> {
     let weights = Weights::read(path)?;
     if let Some(text) = weights.note(RUN) {
         let theirs = RunConfig::from_toml(text).map_err(|problem| bad_config(path, &problem))?;
-        if let Some(difference) = difference(&theirs, config) {
+        if let Some(difference) = difference(&theirs.to_table(), &config.to_table()) {
             let advice = format!("it belongs to another run ({difference}); put this run's in its place, or remove it");
             return Err(Error::checkpoint(path, advice, None));
         }
@@ -270,12 +270,12 @@ pub(super) fn is_open(folder: &Path) -> bool {
 }
 
 /// The first setting in which two configurations differ.
-pub(super) fn difference(there: &RunConfig, wanted: &RunConfig) -> Option<String> {
-    difference_in("", &there.to_table(), &wanted.to_table())
+pub(super) fn difference(there: &toml::Table, wanted: &toml::Table) -> Option<String> {
+    difference_in("", there, wanted)
 }
 
 /// The same for settings whose names begin with `path`.
-pub(super) fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
+fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
     let key = there.keys().chain(wanted.keys()).find(|key| there.get(*key) != wanted.get(*key))?;
     let name = format!("{path}{key}");
     match (there.get(key), wanted.get(key)) {

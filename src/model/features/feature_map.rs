@@ -77,7 +77,13 @@ impl FeatureMap {
 
     /// The network inputs of one observation: raw features, then tanh features, in physical units (not normalised).
     pub fn inputs<'a>(&'a self, obs: &'a [f32]) -> impl Iterator<Item = f32> + 'a {
-        let near = self.near.iter().map(|(i, factor)| tanh(factor * obs[*i]));
+        let raw = self.raw.len();
+        self.linear_inputs(obs).enumerate().map(move |(i, x)| if i < raw { x } else { tanh(x) })
+    }
+
+    /// [`FeatureMap::inputs`] before the tanh.
+    pub(crate) fn linear_inputs<'a>(&'a self, obs: &'a [f32]) -> impl Iterator<Item = f32> + 'a {
+        let near = self.near.iter().map(|(i, factor)| factor * obs[*i]);
         self.raw.iter().map(|i| obs[*i]).chain(near)
     }
 

@@ -1,15 +1,15 @@
 //! Collects the tables of a study from the folders of its runs.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use polars::prelude::*;
 
+use super::admission::{Admission, Candidate};
 use super::read::{self, TableFormat};
 use super::{Tables, inside, numbers};
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
-use crate::study::folder::{check_tables, difference, version};
+use crate::study::folder::{check_tables, version};
 
 impl Tables {
     /// Collects the tables from the folders of runs. A run whose files are missing or damaged is left out, and so is one that
@@ -46,9 +46,7 @@ struct Collected {
     values: Vec<LazyFrame>,
     tests: Vec<LazyFrame>,
     runs: Vec<LazyFrame>,
-    seen: BTreeSet<(String, String, u64, &'static str)>,
-    /// The configuration of the first run of each method on a task.
-    configurations: BTreeMap<(String, String), RunConfig>,
+    admission: Admission,
 }
 
 impl Collected {
@@ -58,21 +56,16 @@ impl Collected {
     /// If it cannot be used; then nothing of it is taken in.
     fn take_in(&mut self, folder: &Path) -> Result<()> {
         let config = RunConfig::read(&folder.join("config.toml"))?;
-        let run = (config.task.clone(), config.method.clone(), config.seed, config.starts.name());
-        if self.seen.contains(&run) {
-            let problem = format!("`{}` on `{}` with seed {} is there twice", config.method, config.task, config.seed);
+        let run = Candidate {
+            task: config.task.clone(),
+            method: config.method.clone(),
+            seed: config.seed,
+            starts: config.starts.name().into(),
+            settings: config.to_table(),
+        };
+        if let Some(objection) = self.admission.objection(&run) {
+            let problem = format!("`{}` on `{}` with seed {} {objection}", run.method, run.task, run.seed);
             return Err(Error::data(folder)(problem));
-        }
-        let method = (config.task.clone(), config.method.clone());
-        if let Some(other) = self.configurations.get(&method) {
-            let like_it = RunConfig { seed: other.seed, starts: other.starts, ..config.clone() };
-            if let Some(difference) = difference(&like_it, other) {
-                let problem = format!(
-                    "`{}` on `{}` with seed {} has another configuration than with seed {} ({difference})",
-                    config.method, config.task, config.seed, other.seed
-                );
-                return Err(Error::data(folder)(problem));
-            }
         }
         check_tables(folder)?;
         let label = |frame: DataFrame| {
@@ -106,8 +99,7 @@ impl Collected {
         self.evaluations.extend(evaluations);
         self.models.extend(models);
         self.values.extend(values);
-        self.seen.insert(run);
-        self.configurations.entry(method).or_insert(config);
+        self.admission.admit(&run);
         Ok(())
     }
 }

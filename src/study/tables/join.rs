@@ -5,10 +5,10 @@ use std::path::PathBuf;
 
 use polars::prelude::*;
 
+use super::admission::{Admission, Candidate};
 use super::gather::concatenate;
 use super::{Tables, inside, numbers, strings};
 use crate::error::{Error, Result};
-use crate::study::folder::difference_in;
 
 /// Task, method and seed.
 type RunName = (String, String, u64);
@@ -23,31 +23,25 @@ impl Tables {
     pub fn read_all(folders: &[PathBuf]) -> Result<Self> {
         let (mut studies, mut taken) = (Vec::new(), Vec::new());
         let (mut left_out, mut methods) = (Vec::new(), Vec::new());
-        let mut configurations: BTreeMap<(String, String), toml::Table> = BTreeMap::new();
+        let mut admission = Admission::default();
         for (at, folder) in folders.iter().enumerate() {
             let tables = Self::read(folder)?;
-            let mut of_runs = settings(&tables)?;
+            let mut settings = settings(&tables)?;
             for name in run_names(&tables.tests).map_err(inside)? {
-                let method = (name.0.clone(), name.1.clone());
-                let settings = of_runs.remove(&name).unwrap_or_default();
-                let others = configurations.entry(method.clone()).or_insert_with(|| settings.clone());
-                let reason = if taken.iter().any(|(_, other)| *other == name) {
-                    Some("it is there twice".into())
-                } else {
-                    difference_in("", &settings, others).map(|how| format!("it has another configuration ({how})"))
-                };
-                match reason {
-                    Some(reason) => {
-                        let run = format!("{}: {} on {} with seed {}", folder.display(), name.1, name.0, name.2);
-                        left_out.push((run, reason));
-                    }
-                    None => {
-                        if !methods.contains(&method) {
-                            methods.push(method);
-                        }
-                        taken.push((at, name));
-                    }
+                let (task, method, seed) = name.clone();
+                let settings = settings.remove(&name).unwrap_or_default();
+                let run = Candidate { task, method, seed, starts: String::new(), settings };
+                if let Some(objection) = admission.objection(&run) {
+                    let run = format!("{}: {} on {} with seed {}", folder.display(), name.1, name.0, name.2);
+                    left_out.push((run, format!("it {objection}")));
+                    continue;
                 }
+                admission.admit(&run);
+                let method = (name.0.clone(), name.1.clone());
+                if !methods.contains(&method) {
+                    methods.push(method);
+                }
+                taken.push((at, name));
             }
             left_out.extend(tables.missing_runs()?);
             studies.push(tables);
@@ -92,17 +86,14 @@ fn run_names(table: &DataFrame) -> PolarsResult<Vec<RunName>> {
     Ok(names.filter(|name| seen.insert(name.clone())).collect())
 }
 
-/// The configuration of each recorded run, without what differs between the runs of a method.
+/// The configuration of each recorded run.
 fn settings(tables: &Tables) -> Result<BTreeMap<RunName, toml::Table>> {
     let mut settings = BTreeMap::new();
     for run in tables.runs()? {
-        let mut table: toml::Table = run.configuration.parse().map_err(|problem: toml::de::Error| {
+        let table: toml::Table = run.configuration.parse().map_err(|problem: toml::de::Error| {
             let problem = problem.message();
             Error::Config(format!("`{}` on `{}`: its configuration is not TOML: {problem}", run.method, run.task))
         })?;
-        for own in ["seed", "starts"] {
-            table.remove(own);
-        }
         settings.insert((run.task, run.method, run.seed), table);
     }
     Ok(settings)

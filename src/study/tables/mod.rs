@@ -7,6 +7,7 @@ use std::path::Path;
 
 use polars::prelude::*;
 
+mod admission;
 mod gather;
 mod join;
 mod read;
