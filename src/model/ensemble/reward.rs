@@ -2,8 +2,8 @@
 //!
 //! A reward is a function of the transition, so its networks read observation, action and next observation, observations as
 //! [`LatentFeatures`]: displacements instead of goals, because a few hundred episodes contain only a few hundred goals. They
-//! share no weights with the networks of the dynamics, whose error would grow with that of the reward. There is one for each
-//! member of the ensemble, all learn from the same transitions, each in its own order.
+//! share no weights with the networks of the dynamics, so that neither disturbs the other's training. There is one for each
+//! member of the ensemble; all learn from the same transitions, each in its own order.
 
 use super::data::Data;
 use super::fit::{Fit, Split};
@@ -81,7 +81,7 @@ impl RewardModel {
     }
 
     pub fn load(&mut self, weights: &Weights) -> Result<()> {
-        let range = weights.get(&format!("{NAME}range"), [1, 1, 2])?;
+        let range = weights.get_within(&format!("{NAME}range"), [1, 1, 2], f32::MIN..=f32::MAX)?;
         let range = [range[0].min(range[1]), range[0].max(range[1])];
         self.networks.load(weights, NAME)?;
         self.range = range;
