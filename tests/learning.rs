@@ -365,6 +365,10 @@ fn a_resumed_run_with_all_that_sac_can_do_ends_as_if_it_had_never_stopped() {
 fn so_does_one_that_plans() {
     let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "test.csv"];
     ends_as_if_it_had_never_stopped(&small_pets(1), &files);
+    // And if the steps of its model are decisions, the last of which the time limit cuts short.
+    let slow = small_pets(2);
+    let pets = PetsConfig { action_repeat: 7, ..slow.settings().expect("PETS's settings") };
+    ends_as_if_it_had_never_stopped(&slow.with_settings(&pets), &files);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use super::Pets;
 use crate::agent::Checkpoint;
-use crate::checkpoint::Weights;
+use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
 
 impl Checkpoint for Pets {
@@ -30,9 +30,13 @@ impl Checkpoint for Pets {
         let (own, planner) = (state.rng("rng")?, state.rng("planner rng")?);
         self.ensemble.load_training_state(state)?;
         self.replay.load(state, "replay")?;
-        self.observed = state.count("counts", self.replay.pushes())? as usize;
+        let (held, most) = self.replay.pushes().into_inner();
+        // Decisions that the time limit cuts short leave no trace.
+        let most = if self.config.action_repeat == 1 { most } else { MAX_COUNT };
+        self.observed = state.count("counts", held..=most)? as usize;
         self.rng = own;
         self.controller = self.controllers.explorer(planner);
+        self.decision.reset();
         self.random.reset();
         Ok(())
     }

@@ -17,6 +17,12 @@ pub struct PetsConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
+    /// Time steps for which each action is held: a decision. The model's steps, and those of a plan, are decisions; a learned
+    /// reward is the mean of theirs, a known one is computed as if a decision were one time step. Planning takes as many times
+    /// less; the model has as many times fewer transitions to learn from. With `control.action_repeat`, it predicts every time
+    /// step.
+    #[doc(alias = "frame skip")]
+    pub action_repeat: usize,
     /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.
     /// Without, an agent moves smoothly in evaluations, and still tries what costs more.
     pub explore_with_costs: bool,
@@ -44,7 +50,7 @@ pub struct PetsConfig {
     pub warm_up_noise_beta: f64,
     /// Time steps between two fits of the model.
     pub fit_every: usize,
-    /// Capacity of the replay buffer, in transitions.
+    /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
 }
 
@@ -54,6 +60,7 @@ impl Default for PetsConfig {
             ensemble: EnsembleConfig::default(),
             planner: PlannerConfig::Icem(IcemConfig::default()),
             control: ControlConfig::default(),
+            action_repeat: 1,
             explore_with_costs: true,
             terminal_weight: 0.0,
             propagation: Propagation::TsInf,
@@ -73,6 +80,7 @@ ranges!(PetsConfig {
     ensemble: Nested,
     planner: Nested,
     control: Nested,
+    action_repeat: 1..=1000,
     explore_with_costs: Any,
     terminal_weight: 0.0..=1e6,
     propagation: Any,

@@ -1,6 +1,7 @@
 //! Receding-horizon control in the learned model: one controller for each environment that PETS acts in.
 
 use super::objective::{EnsembleObjective, PlanningModel};
+use crate::agent::decision::Held;
 use crate::plan::{ControlConfig, MakePlanner, PlanObserver, RecedingHorizon};
 use crate::rng::{self, Rng};
 
@@ -26,19 +27,41 @@ impl MakeController {
 
     fn make(&self, config: &ControlConfig, rng: Rng) -> Controller {
         let planner = self.planner.make(self.action_size);
-        Controller { control: RecedingHorizon::new(planner, self.action_size, config), rng }
+        Controller { control: RecedingHorizon::new(planner, self.action_size, config), held: Held::default(), rng }
     }
 }
 
 /// A controller with its own random numbers.
 pub(super) struct Controller {
-    pub(super) control: RecedingHorizon,
+    control: RecedingHorizon,
+    /// The action that is held.
+    pub(super) held: Held,
     pub(super) rng: Rng,
 }
 
 impl Controller {
-    /// The next action from `obs`; plans in `model` when the last plan is used up.
+    /// Forgets everything: a new episode begins.
+    pub(super) fn reset(&mut self) {
+        self.control.reset();
+        self.held.reset();
+    }
+
+    /// The next action from `obs`; decides anew when the last action has been held long enough.
     pub(super) fn act(
+        &mut self,
+        model: &PlanningModel,
+        obs: &[f32],
+        disagreement_bonus: f32,
+        observer: &mut PlanObserver,
+    ) -> Vec<f32> {
+        let mut held = std::mem::take(&mut self.held);
+        let action = held.next(model.config.action_repeat, || self.decide(model, obs, disagreement_bonus, observer));
+        self.held = held;
+        action
+    }
+
+    /// The next decision from `obs`; plans in `model` when the last plan is used up.
+    pub(super) fn decide(
         &mut self,
         model: &PlanningModel,
         obs: &[f32],

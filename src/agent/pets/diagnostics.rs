@@ -5,9 +5,10 @@ use rayon::prelude::*;
 use super::controller::Controller;
 use super::objective::PlanningModel;
 use super::{DynReward, Pets};
+use crate::agent::decision::in_decisions;
 use crate::agent::{Diagnostics, ValueEstimate};
 use crate::model::Imagination;
-use crate::model::open_loop::{OpenLoop, Propagated, open_loop};
+use crate::model::open_loop::{OfDecisions, OpenLoop, Propagated, open_loop};
 use crate::model::uncertainty::Risk;
 use crate::plan::Iteration;
 use crate::replay::Episode;
@@ -24,6 +25,7 @@ impl Diagnostics for Pets {
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         let Some(dynamics) = &self.dynamics else { return Vec::new() };
         let model = Propagated { dynamics, propagation: self.config.propagation };
+        let model = OfDecisions { model, action_repeat: self.config.action_repeat };
         open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 
@@ -41,6 +43,7 @@ impl Diagnostics for Pets {
 
 /// The prediction of each plan in an episode whose horizon ends before the time limit, and what followed.
 fn predictions(mut controller: Controller, model: &PlanningModel, episode: &Episode) -> Vec<ValueEstimate> {
+    let episode = &in_decisions(episode, model.config.action_repeat);
     let mut estimates = Vec::new();
     for (t, obs) in episode.observations.iter().take(episode.actions.len()).enumerate() {
         let mut plan = Vec::new();
@@ -49,7 +52,7 @@ fn predictions(mut controller: Controller, model: &PlanningModel, episode: &Epis
             let best = returns.max_by(|a, b| a.1.total_cmp(b.1)).map_or(0, |(i, _)| i);
             plan = iteration.candidates.row(best).to_vec();
         };
-        controller.act(model, obs, 0.0, &mut observer);
+        controller.decide(model, obs, 0.0, &mut observer);
         let horizon = plan.len() / episode.actions[t].len();
         let end = (t + horizon).min(episode.actions.len());
         if horizon == 0 || (end < t + horizon && !episode.terminated) {
@@ -65,7 +68,7 @@ fn predictions(mut controller: Controller, model: &PlanningModel, episode: &Epis
     estimates
 }
 
-/// The reward of a recorded time step, as plans count it.
+/// The reward of a recorded decision, as plans count it.
 fn reward_at(known: Option<&DynReward>, episode: &Episode, t: usize) -> f32 {
     let received = episode.rewards[t];
     known.map_or(received, |known| {
@@ -84,17 +87,25 @@ mod tests {
     use crate::plan::{IcemConfig, PlannerConfig};
     use crate::replay::Transition;
 
-    /// A plan's prediction is compared with the rewards of as many recorded time steps as it has. Plans that reach beyond the
+    /// A plan's prediction is compared with the rewards of as many recorded decisions as it has. Plans that reach beyond the
     /// episode are left out.
     #[test]
     fn predictions_are_compared_with_what_followed() {
+        for action_repeat in [1, 3] {
+            compare_predictions(action_repeat);
+        }
+    }
+
+    fn compare_predictions(action_repeat: usize) {
         const HORIZON: usize = 6;
+        const STEPS: usize = 81;
         let icem = IcemConfig { horizon: HORIZON, population: 8, elites: 3, iterations: 1, ..IcemConfig::default() };
         let ensemble =
             EnsembleConfig { members: 2, elites: 2, hidden: vec![8], first_steps: 20, ..EnsembleConfig::default() };
         let config = PetsConfig {
             ensemble,
             planner: PlannerConfig::Icem(icem),
+            action_repeat,
             particles: 2,
             warm_up: 60,
             ..PetsConfig::default()
@@ -104,7 +115,7 @@ mod tests {
             Pets::new(env.spec(), Some(Arc::new(Task::Pendulum.make())), config, 0).expect("usable settings");
         let mut episode = Episode { observations: vec![env.reset(0)], ..Episode::default() };
         assert!(agent.value_estimates(std::slice::from_ref(&episode)).is_empty(), "there is no model yet");
-        for t in 0..80 {
+        for t in 0..STEPS {
             let obs = episode.observations[t].clone();
             let action = agent.act(&obs, Mode::Explore);
             let step = env.step(&action).expect("an action");
@@ -124,9 +135,14 @@ mod tests {
             episode.rewards.push(step.reward);
         }
         let estimates = agent.value_estimates(std::slice::from_ref(&episode));
-        assert_eq!(estimates.len(), 80 - HORIZON + 1);
+        assert_eq!(estimates.len(), STEPS / action_repeat - HORIZON + 1);
+        // The known reward of a decision: as if it were one time step.
+        let of_decision = |i: usize| {
+            let (before, after) = (i * action_repeat, (i + 1) * action_repeat);
+            env.reward(&episode.observations[before], &episode.actions[before], &episode.observations[after])
+        };
         for (t, estimate) in estimates.iter().enumerate() {
-            let received: f32 = episode.rewards[t..t + HORIZON].iter().sum();
+            let received: f32 = (t..t + HORIZON).map(of_decision).sum();
             assert!((estimate.realised - received).abs() < 1e-3, "{t}: {} and {received}", estimate.realised);
             // Six rewards of the pendulum lie between -100 and 0.
             assert!((-120.0..=1.0).contains(&estimate.expected), "{t}: {}", estimate.expected);

@@ -16,7 +16,7 @@
 //! [`crate::plan`].
 //!
 //! Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
-//! actions at the beginning are coloured noise; those of the [ensemble](crate::model::ensemble). Risk measures other than the
+//! actions at the beginning are coloured noise; an action may be held for several time steps; those of the [ensemble](crate::model::ensemble). Risk measures other than the
 //! mean, a penalty or a bonus for disagreement, a reward for a plan's last state, and a learned reward are optional.
 
 mod checkpoint;
@@ -33,6 +33,7 @@ pub use config::PetsConfig;
 use controller::{Controller, MakeController};
 use objective::PlanningModel;
 
+use super::decision::{Decision, Over};
 use super::warm_up::RandomActions;
 use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::{KnownReward, Spec};
@@ -92,6 +93,7 @@ pub struct Pets {
     dynamics: Option<Dynamics>,
     replay: ReplayBuffer,
     observed: usize,
+    decision: Decision,
     random: RandomActions,
     controllers: MakeController,
     /// Plans in the environment that it learns from.
@@ -118,6 +120,7 @@ impl Pets {
             )));
         }
         let mut rng = rng::stream(seed, "pets");
+        let decisions = spec.horizon.div_ceil(config.action_repeat);
         let controllers = MakeController {
             planner: Box::new(config.planner.clone()),
             config: config.control.clone(),
@@ -129,7 +132,8 @@ impl Pets {
             dynamics: None,
             replay: ReplayBuffer::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
-            random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
+            decision: Decision::default(),
+            random: RandomActions::new(config.warm_up_noise_beta, decisions, spec.action_size),
             controller: controllers.explorer(rng::stream(seed, "pets planner")),
             controllers,
             slots: Slots::default(),
@@ -175,7 +179,8 @@ impl Pets {
 
 impl Agent for Pets {
     fn begin_episode(&mut self) {
-        self.controller.control.reset();
+        self.controller.reset();
+        self.decision.reset();
         self.random.reset();
         self.slots.clear(0);
     }
@@ -183,7 +188,7 @@ impl Agent for Pets {
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
         let Self { config, spec, reward, dynamics, random, controllers, controller, slots, rng, .. } = self;
         match (dynamics, mode) {
-            (None, Mode::Explore) => random.next(rng),
+            (None, Mode::Explore) => controller.held.next(config.action_repeat, || random.next(rng)),
             (None, Mode::Evaluate) => vec![0.0; spec.action_size],
             (Some(dynamics), Mode::Explore) => {
                 let model = PlanningModel::new(config, dynamics, reward.as_deref());
@@ -226,10 +231,12 @@ impl Agent for Pets {
     }
 
     fn observe(&mut self, transition: &Transition) {
-        self.replay.push(transition);
+        if let Some(Over::Whole(decision)) = self.decision.join(transition, self.config.action_repeat) {
+            self.replay.push(&decision);
+        }
         self.observed += 1;
         if transition.terminated || transition.truncated {
-            self.controller.control.reset();
+            self.controller.reset();
             self.random.reset();
         }
     }
