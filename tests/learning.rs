@@ -569,7 +569,7 @@ fn renamed_keys_are_understood() {
         ("disagreement_bonus", "curiosity"),
         ("warm_up_noise_beta", "warm_up_colour"),
         ("noise_beta", "colour"),
-        ("action_repeat", "hold"),
+        ("[pets.control]\naction_repeat", "[pets.control]\nhold"),
         ("final_learning_rate_fraction", "anneal"),
         ("\"ts-inf-mean\"", "\"members\""),
     ];
