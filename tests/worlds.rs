@@ -293,6 +293,9 @@ fn the_reward_in_logarithm_pulls_from_afar() {
             if task == Task::Reach {
                 assert!((step.reward - paid.reward.ln()).abs() < 1e-3, "{} and {}", step.reward, paid.reward);
             }
+            if task == Task::Push {
+                assert_eq!(step.reward == 0.0, step.success, "as much as there is at success, and less elsewhere");
+            }
             obs = step.observation;
             last = Some((step.reward, step.success));
         }

@@ -17,10 +17,11 @@ pub struct PetsConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
-    /// Time steps for which each action is held: a decision. The model's steps, and those of a plan, are decisions; a learned
-    /// reward is the mean of theirs, a known one is computed as if a decision were one time step. Planning takes as many times
-    /// less; the model has as many times fewer transitions to learn from. With `control.action_repeat`, it predicts every time
-    /// step.
+    /// Time steps for which each action is held: a decision. The steps of the model, of plans and of the random actions' noise are
+    /// decisions, and so costs, penalties and disagreement count decisions. A learned reward is the mean over a decision; a known
+    /// one is computed as if the decision were one time step. With k time steps, a plan over the same time takes 1/k of the
+    /// predictions, and the model has 1/k of the transitions to learn from. `control.action_repeat` holds planned actions, too,
+    /// but there the model predicts every time step.
     #[doc(alias = "frame skip")]
     pub action_repeat: usize,
     /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.

@@ -144,8 +144,9 @@ mod tests {
         for (t, estimate) in estimates.iter().enumerate() {
             let received: f32 = (t..t + HORIZON).map(of_decision).sum();
             assert!((estimate.realised - received).abs() < 1e-3, "{t}: {} and {received}", estimate.realised);
-            // Six rewards of the pendulum lie between -100 and 0, if a model of so few data keeps to its speeds.
-            assert!((-300.0..=1.0).contains(&estimate.expected), "{t}: {}", estimate.expected);
+            // Six rewards of the pendulum lie between -100 and 0; a model of 20 decisions may predict speeds beyond the limit.
+            let least = if action_repeat == 1 { -120.0 } else { -300.0 };
+            assert!((least..=1.0).contains(&estimate.expected), "{t}: {}", estimate.expected);
         }
     }
 }

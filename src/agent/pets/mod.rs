@@ -16,8 +16,9 @@
 //! [`crate::plan`].
 //!
 //! Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
-//! actions at the beginning are coloured noise; an action may be held for several time steps; those of the [ensemble](crate::model::ensemble). Risk measures other than the
-//! mean, a penalty or a bonus for disagreement, a reward for a plan's last state, and a learned reward are optional.
+//! actions at the beginning are coloured noise; those of the [ensemble](crate::model::ensemble). Risk measures other than the
+//! mean, a penalty or a bonus for disagreement, a reward for a plan's last state, a learned reward, and a model of decisions
+//! that hold an action for several time steps are optional.
 
 mod checkpoint;
 mod config;
@@ -119,6 +120,12 @@ impl Pets {
                 spec.name
             )));
         }
+        if config.action_repeat > spec.horizon {
+            return Err(Error::Config(format!(
+                "pets.action_repeat: an episode of `{}` has only {} time steps, fewer than one decision of {}",
+                spec.name, spec.horizon, config.action_repeat
+            )));
+        }
         let mut rng = rng::stream(seed, "pets");
         let decisions = spec.horizon.div_ceil(config.action_repeat);
         let controllers = MakeController {
@@ -160,6 +167,9 @@ impl Pets {
     /// Fits the model to the replay buffer, and plans in it from the next action on. Returns `model_loss` (the mean negative
     /// log-likelihood of normalised targets), `model_steps` (gradient steps) and `model_error` (the mean squared error on
     /// held-out transitions, in normalised units).
+    ///
+    /// # Panics
+    /// If fewer than two decisions have been observed.
     pub fn fit(&mut self) -> Losses {
         // Inside the thread pool: a parallel section entered from outside hands its work over each time.
         let fit = rayon::scope(|_| self.ensemble.fit(&self.replay, &mut self.rng));
@@ -243,7 +253,9 @@ impl Agent for Pets {
 
     fn update(&mut self) -> Option<Losses> {
         let since = self.observed.checked_sub(self.config.warm_up)?;
-        since.is_multiple_of(self.config.fit_every).then(|| self.fit())
+        // A short warm-up of long decisions may leave too few of them for the first fit.
+        let due = self.dynamics.is_none() || since.is_multiple_of(self.config.fit_every);
+        (due && self.replay.len() >= 2).then(|| self.fit())
     }
 }
 
