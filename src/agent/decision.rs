@@ -1,5 +1,6 @@
 //! Decisions that last several time steps: an action that is held, and the experience that it brings.
 
+use crate::checkpoint::MAX_COUNT;
 use crate::replay::{Episode, Transition};
 
 /// An action that is held.
@@ -83,6 +84,12 @@ pub(super) fn in_decisions(episode: &Episode, steps: usize) -> Episode {
         rewards: episode.rewards.chunks(steps).take(whole).map(mean).collect(),
         terminated: episode.terminated,
     }
+}
+
+/// The most time steps that an agent can have observed after `pushes` time steps went into its replay buffer: a decision that
+/// the time limit cuts short leaves no trace there.
+pub(super) fn most_observed(pushes: u64, action_repeat: usize) -> u64 {
+    if action_repeat == 1 { pushes } else { MAX_COUNT }
 }
 
 #[cfg(test)]

@@ -39,10 +39,10 @@ use policy_state::PolicyState;
 pub use returns::{ReturnScale, lambda_returns, replay_lambda_returns};
 use update::Networks;
 
-use super::decision::{Decision, Over, in_decisions};
+use super::decision::{Decision, Over, in_decisions, most_observed};
 use super::warm_up::RandomActions;
 use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots, ValueEstimate};
-use crate::checkpoint::{MAX_COUNT, Weights};
+use crate::checkpoint::Weights;
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::WorldModel;
@@ -276,8 +276,7 @@ impl Checkpoint for Dreamer {
         state.load_module("slow", &mut self.networks.target)?;
         self.optimiser.load(state, "optimiser", &self.networks)?;
         self.replay.load(state, "replay")?;
-        // Decisions that the time limit cuts short leave no trace.
-        let most = if self.config.action_repeat == 1 { self.replay.most_pushes() } else { MAX_COUNT };
+        let most = most_observed(self.replay.most_pushes(), self.config.action_repeat);
         self.observed = state.count("counts", 0..=most)? as usize;
         self.scale = ReturnScale::from_range(low, high);
         self.update_credit = update_credit;

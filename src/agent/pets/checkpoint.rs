@@ -2,7 +2,8 @@
 
 use super::Pets;
 use crate::agent::Checkpoint;
-use crate::checkpoint::{MAX_COUNT, Weights};
+use crate::agent::decision::most_observed;
+use crate::checkpoint::Weights;
 use crate::error::Result;
 
 impl Checkpoint for Pets {
@@ -31,8 +32,7 @@ impl Checkpoint for Pets {
         self.ensemble.load_training_state(state)?;
         self.replay.load(state, "replay")?;
         let (held, most) = self.replay.pushes().into_inner();
-        // Decisions that the time limit cuts short leave no trace.
-        let most = if self.config.action_repeat == 1 { most } else { MAX_COUNT };
+        let most = most_observed(most, self.config.action_repeat);
         self.observed = state.count("counts", held..=most)? as usize;
         self.rng = own;
         self.controller = self.controllers.explorer(planner);

@@ -4,7 +4,7 @@ use dfdx::prelude::*;
 
 use super::Sac;
 use super::temperature::Temperature;
-use crate::agent::decision::in_decisions;
+use crate::agent::decision::{in_decisions, most_observed};
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
@@ -70,8 +70,7 @@ impl Checkpoint for Sac {
         self.critic_optimiser.load(state, "critics", &self.critics)?;
         self.replay.load(state, "replay")?;
         let (held, most) = self.replay.pushes().into_inner();
-        // Decisions that the time limit cuts short leave no trace.
-        let most = if self.config.action_repeat == 1 { most } else { MAX_COUNT };
+        let most = most_observed(most, self.config.action_repeat);
         let counts = state.counts_within("counts", &[held..=most, 0..=MAX_COUNT])?;
         self.temperature.moments = [first, second];
         self.temperature.steps = steps.max(0.0) as i32;

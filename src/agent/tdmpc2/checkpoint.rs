@@ -3,9 +3,9 @@
 use rayon::prelude::*;
 
 use super::{Controller, Networks, RunningScale, TdMpc2};
-use crate::agent::decision::in_decisions;
+use crate::agent::decision::{in_decisions, most_observed};
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
-use crate::checkpoint::{MAX_COUNT, Weights};
+use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::model::Probed;
 use crate::model::open_loop::{OfDecisions, OpenLoop, open_loop};
@@ -80,8 +80,7 @@ impl Checkpoint for TdMpc2 {
         self.policy_optimiser.load(state, "policy", &self.networks.policy)?;
         self.probe_optimiser.load(state, "probe", &self.networks.probe)?;
         self.replay.load(state, "replay")?;
-        // Decisions that the time limit cuts short leave no trace.
-        let most = if self.config.action_repeat == 1 { self.replay.most_pushes() } else { MAX_COUNT };
+        let most = most_observed(self.replay.most_pushes(), self.config.action_repeat);
         self.observed = state.count("counts", 0..=most)? as usize;
         self.scale = RunningScale::new(scale.max(f32::MIN_POSITIVE));
         self.update_credit = update_credit;
