@@ -214,6 +214,10 @@ const fans = plans.map((plan) =>
       pixels: 1.5 + 1.5 * clamp(value, 0, 1),
     })),
 );
+// While an action is held, or the next one of a plan executed, nothing is planned: the last plan is shown until the next.
+fans.forEach((fan, i) => {
+  if (fan.length === 0 && i > 0) fans[i] = fans[i - 1];
+});
 
 function drawRibbons({ ribbons, camera, renderer }) {
   const { position, color: colors } = ribbons.mesh.geometry.attributes;

@@ -19,12 +19,12 @@ pub(super) struct Data {
 
 impl Data {
     /// Normalises physical inputs (`[rows, inputs]`) and targets (`[rows, outputs]`), having fitted the normalisers of
-    /// `networks` to them with these floors of the standard deviations, and clips the targets to `max_target`.
+    /// `networks` to them with these floors of the standard deviations, and clips both to these limits.
     pub fn new(
         networks: &mut Networks,
         [mut inputs, mut targets]: [Vec<f32>; 2],
         [input_floors, target_floors]: [&[f32]; 2],
-        max_target: f32,
+        [max_input, max_target]: [f32; 2],
     ) -> Self {
         networks.inputs = Normaliser::fit(&inputs, input_floors);
         networks.targets = Normaliser::fit(&targets, target_floors);
@@ -34,6 +34,7 @@ impl Data {
         }
         networks.inputs.normalise(&mut inputs);
         networks.targets.normalise(&mut targets);
+        inputs.iter_mut().for_each(|input| *input = input.clamp(-max_input, max_input));
         targets.iter_mut().for_each(|target| *target = target.clamp(-max_target, max_target));
         Self { rows: inputs.len() / input_floors.len(), inputs, targets }
     }

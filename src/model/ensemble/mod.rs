@@ -157,7 +157,12 @@ impl Ensemble {
         let flip = 1.0 / self.config.max_target;
         let target_floor = |i: &usize| if self.flags[*i] { floor(i).max(flip) } else { floor(i) };
         let target_floors: Vec<f32> = self.features.predicted.iter().map(target_floor).collect();
-        Data::new(&mut self.networks, [inputs, targets], [&input_floors, &target_floors], self.config.max_target)
+        Data::new(
+            &mut self.networks,
+            [inputs, targets],
+            [&input_floors, &target_floors],
+            [f32::INFINITY, self.config.max_target],
+        )
     }
 
     /// The elites as a model to predict and plan with: a snapshot, which later fits do not change.

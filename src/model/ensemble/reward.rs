@@ -18,6 +18,9 @@ use crate::nn::two_hot::{symexp, symlog};
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 
+/// Normalised inputs are clipped to this. A cube that is hit once has forty standard deviations of the velocity of one that lies
+/// still: held out, one such transition would decide when every fit stops.
+const MAX_INPUT: f32 = 10.0;
 /// Prefix of its arrays in a checkpoint.
 const NAME: &str = "reward.";
 
@@ -57,7 +60,8 @@ impl RewardModel {
             .iter()
             .fold([f32::INFINITY, f32::NEG_INFINITY], |[low, high], target| [low.min(*target), high.max(*target)]);
         let floors = vec![MIN_STD; self.inputs.width()];
-        let data = Data::new(&mut self.networks, [inputs, targets], [&floors, &[MIN_STD]], config.max_target);
+        let data =
+            Data::new(&mut self.networks, [inputs, targets], [&floors, &[MIN_STD]], [MAX_INPUT, config.max_target]);
         self.networks.fit(config, &data, split, limit, rng)
     }
 
@@ -162,6 +166,7 @@ impl LearnedReward {
                 x.iter_mut().zip(&inputs).for_each(|(x, input)| x.0[place] = *input);
             }
             self.normaliser.normalise_panel(x);
+            x.iter_mut().for_each(|x| x.0.iter_mut().for_each(|x| *x = x.clamp(-MAX_INPUT, MAX_INPUT)));
             let y = &network.forward(&mut panels)[0];
             for (reward, y) in rewards.iter_mut().zip(&y.0) {
                 *reward = self.unit * symexp((self.mean + self.scale * y).clamp(self.range[0], self.range[1]));
