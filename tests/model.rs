@@ -543,7 +543,7 @@ fn a_learned_reward_knows_goals_that_it_has_not_seen() {
         let reward = learned.reward(transition[0], &[[1.0, -1.0][row]], transition[1]);
         assert!((reward - mean).abs() < 1e-6, "{reward}, not {mean}");
     }
-    // Far from all data it reads no more than that it is far, and stays within the rewards that were received.
+    // Far from all data its inputs are clipped, and its predictions stay within the rewards that were received.
     assert!([-1.0, 1.0].iter().all(|side| reward(side * 30.0, 0.3) == reward(side * 1e6, 0.3)));
     let received: Vec<f32> = (0..data.len()).map(|i| data.row(i).reward).collect();
     let (low, high) = received.iter().fold((f32::MAX, f32::MIN), |(low, high), r| (low.min(*r), high.max(*r)));

@@ -86,8 +86,8 @@ pub(super) fn in_decisions(episode: &Episode, steps: usize) -> Episode {
     }
 }
 
-/// The most time steps that an agent can have observed after `pushes` time steps went into its replay buffer: a decision that
-/// the time limit cuts short leaves no trace there.
+/// The most time steps that an agent can have observed if at most `pushes` entries went into its replay buffer. With held
+/// actions there is no bound: a decision that the time limit cuts short leaves no trace there.
 pub(super) fn most_observed(pushes: u64, action_repeat: usize) -> u64 {
     if action_repeat == 1 { pushes } else { MAX_COUNT }
 }

@@ -19,7 +19,7 @@ pub(super) struct Data {
 
 impl Data {
     /// Normalises physical inputs (`[rows, inputs]`) and targets (`[rows, outputs]`), having fitted the normalisers of
-    /// `networks` to them with these floors of the standard deviations, and clips both to these limits.
+    /// `networks` to them with these floors of the standard deviations, and clips both, normalised, to these limits.
     pub fn new(
         networks: &mut Networks,
         [mut inputs, mut targets]: [Vec<f32>; 2],

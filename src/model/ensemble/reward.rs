@@ -18,8 +18,8 @@ use crate::nn::two_hot::{symexp, symlog};
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 
-/// Normalised inputs are clipped to this. A cube that is hit once has forty standard deviations of the velocity of one that lies
-/// still: held out, one such transition would decide when every fit stops.
+/// Normalised inputs are clipped to this. Where a cube is seldom hit, its velocity after a hit can be forty standard deviations
+/// from the mean; if one such transition is held out, its error decides when every fit stops.
 const MAX_INPUT: f32 = 10.0;
 /// Prefix of its arrays in a checkpoint.
 const NAME: &str = "reward.";
