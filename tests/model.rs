@@ -497,32 +497,42 @@ fn a_cube_may_lie_on_any_side() {
     }
 }
 
-/// A goal does not move, so the dynamics need not see it; but a learned reward must, also where it has never been.
-#[test]
-fn a_learned_reward_knows_goals_that_it_has_not_seen() {
+/// The observation on a line with a goal.
+fn at(x: f32, goal: f32) -> Vec<f32> {
+    vec![x, goal, goal - x]
+}
+
+/// An ensemble that has learned the reward, minus the distance to the goal, from 2000 transitions with these goals; and the
+/// transitions.
+fn with_goals(goals: &[f32], config: EnsembleConfig) -> (Ensemble, ReplayBuffer) {
     let features = [Feature::new("x"), Feature::new("goal").constant(), Feature::new("way").difference("goal", "x")];
     let spec = Spec::new("line", features, 1, 50, 0.1);
     let mut rng = rng::stream(0, "goals");
     let mut data = ReplayBuffer::new(3, 1, 2000);
-    for i in 0..2000 {
+    for goal in goals.iter().cycle().take(2000) {
         let [x, action] = [0; 2].map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32);
-        // Eight goals: -0.7, -0.5, ... 0.7.
-        let (goal, next) = ((i % 8) as f32 * 0.2 - 0.7, x + 0.1 * action);
+        let next = x + 0.1 * action;
         data.push(&Transition {
-            obs: vec![x, goal, goal - x],
+            obs: at(x, *goal),
             action: vec![action],
             reward: -(goal - next).abs(),
-            next_obs: vec![next, goal, goal - next],
+            next_obs: at(next, *goal),
             terminated: false,
             truncated: false,
         });
     }
-    let mut ensemble =
-        Ensemble::new(&spec, EnsembleConfig { learn_reward: true, ..config() }, &mut rng).expect("usable settings");
+    let config = EnsembleConfig { learn_reward: true, ..config };
+    let mut ensemble = Ensemble::new(&spec, config, &mut rng).expect("usable settings");
     assert_eq!(ensemble.fit(&data, &mut rng).reward_errors.len(), ensemble.dynamics().members());
+    (ensemble, data)
+}
+
+/// A goal does not move, so the dynamics need not see it; but a learned reward must, also where it has never been.
+#[test]
+fn a_learned_reward_knows_goals_that_it_has_not_seen() {
+    let (ensemble, data) = with_goals(&[-0.7, -0.5, -0.3, -0.1, 0.1, 0.3, 0.5, 0.7], config());
     let dynamics = ensemble.dynamics();
     let learned = dynamics.learned_reward().expect("a learned reward");
-    let at = |x: f32, goal: f32| vec![x, goal, goal - x];
     let reward = |x: f32, goal: f32| learned.reward(&at(x, goal), &[0.0], &at(x, goal));
     for (x, goal) in [(0.6, 0.6), (-0.5, 0.6), (0.6, -0.4), (-0.8, 0.0)] {
         let (predicted, truth) = (reward(x, goal), -(goal - x).abs());
@@ -551,6 +561,27 @@ fn a_learned_reward_knows_goals_that_it_has_not_seen() {
         let predicted = reward(x, 0.3);
         assert!((low - 1e-4..=high + 1e-4).contains(&predicted), "at {x}: {predicted}, received {low} to {high}");
     }
+}
+
+/// Two goals can be told apart by their places, and nothing in the data says that the next goal has the same reward around it.
+#[test]
+fn with_a_group_lasso_a_learned_reward_depends_on_differences_alone() {
+    let predictions = |reward_lasso: f32| {
+        let (ensemble, _) = with_goals(&[-0.5, 0.5], EnsembleConfig { reward_lasso, ..config() });
+        let dynamics = ensemble.dynamics();
+        let learned = dynamics.learned_reward().expect("a learned reward").clone();
+        move |x: f32, goal: f32| learned.reward(&at(x, goal), &[0.0], &at(x, goal))
+    };
+    let (lasso, none) = (predictions(10.0), predictions(0.0));
+    let mut moved = 0.0_f32;
+    for way in [-0.75, -0.25, 0.125, 0.5] {
+        let [here, there] =
+            [0.5, -0.125].map(|goal| [&lasso as &dyn Fn(f32, f32) -> f32, &none].map(|f| f(goal - way, goal)));
+        assert!((here[0] + way.abs()).abs() < 0.1, "{way} from the goal: {}", here[0]);
+        assert!((here[0] - there[0]).abs() < 1e-5, "{way} from the goal, wherever it is: {} and {}", here[0], there[0]);
+        moved = moved.max((here[1] - there[1]).abs());
+    }
+    assert!(moved > 1e-3, "without it, predictions depend on the place of the goal: {moved}");
 }
 
 #[test]

@@ -496,6 +496,26 @@ fn clipping_scales_the_whole_gradient() {
 }
 
 #[test]
+fn a_group_lasso_shortens_the_weights_of_an_input() {
+    let before = network(2, Norm::None, 5);
+    let mut after = before.clone();
+    let norms = |network: &Mlp, member: usize| -> Vec<f32> {
+        let (weight, bias) = network.layers_of(member).next().expect("a layer");
+        weight.chunks_exact(bias.len()).map(|row| row.iter().map(|w| w * w).sum::<f32>().sqrt()).collect()
+    };
+    let inputs = norms(&before, 0).len();
+    let mut thresholds = vec![0.0; inputs];
+    (thresholds[0], thresholds[1]) = (0.25, 1e3);
+    after.shrink_inputs(&thresholds);
+    for member in 0..2 {
+        let (before, after) = (norms(&before, member), norms(&after, member));
+        assert!((before[0] - after[0] - 0.25).abs() < 1e-5, "{} to {}", before[0], after[0]);
+        assert_eq!(after[1], 0.0);
+        assert_eq!(before[2..], after[2..]);
+    }
+}
+
+#[test]
 fn targets_follow_by_polyak() {
     let (mut target, mut source) = (network(1, Norm::None, 4), network(1, Norm::None, 5));
     target.parameters_mut().into_iter().for_each(|(_, p)| p.copy_from(&vec![1.0; values(p).len()]));

@@ -63,6 +63,12 @@ pub struct EnsembleConfig {
     /// errors count, below it absolute ones. A small unit tells small rewards apart, such as those far from a goal.
     #[doc(alias = "symlog")]
     pub reward_unit: f32,
+    /// Group lasso on the inputs of the networks that learn the reward, except differences, such as the vector from the hand to
+    /// a goal: each step shortens the weights that leave an input, as one vector, by `learning_rate * reward_lasso`. Without
+    /// it, networks tell a few episodes apart by what is constant in each, such as the place of the goal, and are wrong in
+    /// the next one. It has no effect where no feature is a [difference](crate::env::Feature::difference).
+    #[doc(alias = "group lasso")]
+    pub reward_lasso: f32,
     /// Whether each predicted change is multiplied by a learned gate, a sigmoid with its own output, which can close over
     /// whole regions of the input: a cube that is not touched stays where it is. Without gates its predicted position
     /// drifts slightly, and planners exploit that.
@@ -91,6 +97,7 @@ impl Default for EnsembleConfig {
             learn_reward: false,
             reward_hidden: vec![64; 2],
             reward_unit: 1.0,
+            reward_lasso: 0.0,
             gated: false,
         }
     }
@@ -116,6 +123,7 @@ ranges!(EnsembleConfig {
     learn_reward: Any,
     reward_hidden: 1..=4096,
     reward_unit: 1e-9..=1e9,
+    reward_lasso: 0.0..=1e3,
     gated: Any,
 }
 require elites <= members => "`elites` must not exceed `members`";

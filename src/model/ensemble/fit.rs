@@ -140,12 +140,12 @@ impl Networks {
                 minibatches.push(schedule.next(batch, rng));
             }
         }
-        let gated = self.gated;
+        let (gated, lasso) = (self.gated, &self.lasso);
         let members = self.members.par_iter_mut().zip(minibatches);
         let losses: Vec<f64> = members
             .map(|(member, minibatches)| {
                 let steps = minibatches.iter().zip(rates);
-                steps.map(|(rows, rate)| f64::from(member.gradient_step(data, rows, *rate, gated, config))).sum()
+                steps.map(|(rows, rate)| f64::from(member.gradient_step(data, rows, *rate, gated, lasso, config))).sum()
             })
             .collect();
         losses.iter().sum()
@@ -203,12 +203,17 @@ impl Member {
         rows: &[usize],
         learning_rate: f32,
         gated: bool,
+        lasso: &[f32],
         config: &EnsembleConfig,
     ) -> f32 {
         let loss = self.learner.nll(data.inputs_of(rows).leaky_traced(), &data.targets_of(rows), gated, config);
         let value = values(&loss)[0];
         self.optimiser.set_learning_rate(learning_rate);
         self.optimiser.step(&mut self.learner, &mut loss.sum().backward());
+        if !lasso.is_empty() {
+            let thresholds: Vec<f32> = lasso.iter().map(|coefficient| learning_rate * coefficient).collect();
+            self.learner.network.shrink_inputs(&thresholds);
+        }
         value
     }
 }

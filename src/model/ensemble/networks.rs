@@ -21,6 +21,8 @@ pub(super) struct Networks {
     pub elites: Vec<usize>,
     /// Whether each mean is multiplied by a gate.
     pub gated: bool,
+    /// The coefficient of each input in a group lasso; none at all without one.
+    pub lasso: Vec<f32>,
 }
 
 impl Networks {
@@ -55,6 +57,7 @@ impl Networks {
             temperature: vec![1.0; outputs],
             elites: (0..config.elites).collect(),
             gated,
+            lasso: Vec::new(),
         }
     }
 }

@@ -38,7 +38,10 @@ pub(super) struct RewardModel {
 impl RewardModel {
     pub fn new(spec: &Spec, config: &EnsembleConfig, rng: &mut Rng) -> Self {
         let inputs = Inputs { features: LatentFeatures::new(spec), actions: spec.action_size };
-        let networks = Networks::new(config, [inputs.width(), 1], &config.reward_hidden, false, rng);
+        let mut networks = Networks::new(config, [inputs.width(), 1], &config.reward_hidden, false, rng);
+        if config.reward_lasso > 0.0 && inputs.features.differences().any(|difference| difference) {
+            networks.lasso = inputs.lasso(config.reward_lasso);
+        }
         Self { networks, inputs, unit: config.reward_unit, range: [0.0; 2] }
     }
 
@@ -111,6 +114,13 @@ struct Inputs {
 impl Inputs {
     fn width(&self) -> usize {
         2 * self.features.width() + self.actions
+    }
+
+    /// The coefficient of each input: 0 for differences.
+    fn lasso(&self, coefficient: f32) -> Vec<f32> {
+        let features = self.features.differences().map(|difference| if difference { 0.0 } else { coefficient });
+        let features: Vec<f32> = features.collect();
+        [&features, &vec![coefficient; self.actions], &features].into_iter().flatten().copied().collect()
     }
 
     /// Appends the inputs of a transition: observation, action, next observation.

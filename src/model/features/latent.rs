@@ -63,6 +63,11 @@ impl LatentFeatures {
         self.raw.len() + self.near.len()
     }
 
+    /// Whether each encoder input comes from a difference.
+    pub(crate) fn differences(&self) -> impl Iterator<Item = bool> {
+        self.raw.iter().chain(&self.near).map(|feature| self.near.contains(feature))
+    }
+
     /// Features in an observation.
     pub fn observation_size(&self) -> usize {
         self.centre.len()
