@@ -4,9 +4,9 @@
 use dfdx::prelude::*;
 use handful::nn::kernels::{self, DenseShape, Matrix};
 use handful::nn::{
-    Activation, Adam, AdamConfig, BlockDense, Grad, Init, Mlp, MlpConfig, Norm, Parameters, SquashedGaussian,
-    SymexpBins, SymlogBins, Tensor3, Weights, copy_parameters, device, norm, ops, polyak, recurrent, simnorm, tensor,
-    values,
+    Activation, Adam, AdamConfig, BlockDense, Grad, GroupLasso, Init, Mlp, MlpConfig, Norm, Parameters,
+    SquashedGaussian, SymexpBins, SymlogBins, Tensor3, Weights, copy_parameters, device, norm, ops, polyak, recurrent,
+    simnorm, tensor, values,
 };
 use handful::rng::{self, Rng};
 
@@ -504,9 +504,9 @@ fn a_group_lasso_shortens_the_weights_of_an_input() {
         weight.chunks_exact(bias.len()).map(|row| row.iter().map(|w| w * w).sum::<f32>().sqrt()).collect()
     };
     let inputs = norms(&before, 0).len();
-    let mut thresholds = vec![0.0; inputs];
-    (thresholds[0], thresholds[1]) = (0.25, 1e3);
-    after.shrink_inputs(&thresholds);
+    let mut coefficients = vec![0.0; inputs];
+    (coefficients[0], coefficients[1]) = (2.5, 1e4);
+    GroupLasso { coefficients }.step(&mut after, 0.1);
     for member in 0..2 {
         let (before, after) = (norms(&before, member), norms(&after, member));
         assert!((before[0] - after[0] - 0.25).abs() < 1e-5, "{} to {}", before[0], after[0]);

@@ -190,23 +190,9 @@ impl Mlp {
         self
     }
 
-    /// The proximal step of a group lasso (Yuan & Lin 2006) on the inputs: the weights that leave input `i`, as one vector, become
-    /// shorter by `thresholds[i]`, or zero. Inputs that the outputs do not depend on are left out in time.
-    ///
-    /// # Panics
-    /// If there is not one threshold for each input.
-    #[doc(alias = "proximal gradient")]
-    #[doc(alias = "feature selection")]
-    pub fn shrink_inputs(&mut self, thresholds: &[f32]) {
-        let weight = &mut self.layers[0].weight;
-        let (_, inputs, outputs) = *weight.shape();
-        assert_eq!(thresholds.len(), inputs, "one threshold for each input");
-        let rows = values_mut(weight).chunks_exact_mut(outputs).zip(thresholds.iter().cycle());
-        for (row, threshold) in rows.filter(|(_, threshold)| **threshold > 0.0) {
-            let norm = row.iter().map(|w| w * w).sum::<f32>().sqrt();
-            let kept = if norm > *threshold { 1.0 - threshold / norm } else { 0.0 };
-            row.iter_mut().for_each(|w| *w *= kept);
-        }
+    /// The weights of the first layer, `[members, input, output]`.
+    pub(super) fn first_weight_mut(&mut self) -> &mut Tensor3 {
+        &mut self.layers[0].weight
     }
 
     /// Networks of the given layers, each a weight `[input, output]` and a bias `[output]`, for each member.

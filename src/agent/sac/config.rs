@@ -59,6 +59,11 @@ pub struct SacConfig {
     /// Whether the networks read what latent models read ([`LatentFeatures`](crate::model::features::LatentFeatures)): positions
     /// relative to the hand, small distances magnified, cubes in canonical orientation.
     pub latent_features: bool,
+    /// Group lasso on the inputs of policy and critics, except actions and differences, such as the vector from the hand to a
+    /// goal: each step shortens the weights that leave an input, as one vector, by `learning_rate * lasso`. See
+    /// [`EnsembleConfig::reward_lasso`](crate::model::EnsembleConfig::reward_lasso). It needs `latent_features`.
+    #[doc(alias = "group lasso")]
+    pub lasso: f32,
     /// Decisions whose rewards are in a target: n-step returns. The entropy of those between is left out.
     #[doc(alias = "multi-step return")]
     pub n_step: usize,
@@ -97,6 +102,7 @@ impl Default for SacConfig {
             warm_up_noise_beta: None,
             exploration_noise_beta: None,
             latent_features: false,
+            lasso: 0.0,
             n_step: 1,
             hindsight: 0.0,
             updates_per_step: 1,
@@ -132,12 +138,14 @@ ranges!(SacConfig {
     warm_up_noise_beta: 0.0..=10.0,
     exploration_noise_beta: 0.0..=10.0,
     latent_features: Any,
+    lasso: 0.0..=1e3,
     n_step: 1..=1000,
     hindsight: 0.0..=1.0,
     updates_per_step: 1..=1000,
     critic_updates_per_policy_update: 1..=1_000_000,
     max_gradient_norm: 1e-6..=1e9,
 }
+require *lasso == 0.0 || *latent_features => "`lasso` needs `latent_features`";
 require fits(&[*critics, weights_between(hidden)]) => "`critics` with the layers of `hidden` have too many weights";
 require fits(&[*critics, *batch, hidden.iter().sum()]) => "`critics` times `batch` times `hidden` does not fit into memory";
 );

@@ -41,6 +41,14 @@ impl Inputs {
         }
     }
 
+    /// Coefficients of a group lasso on the inputs, if there is one.
+    pub(super) fn lasso(&self, coefficient: f32) -> Option<Vec<f32>> {
+        match self {
+            Self::Scaled { .. } => None,
+            Self::Latent(features) => features.lasso(coefficient),
+        }
+    }
+
     /// The inputs `[1, rows, width]` of observations `[rows, observation]`.
     pub(super) fn of(&self, cpu: &Cpu, observations: &[f32]) -> Tensor3 {
         match self {

@@ -38,8 +38,8 @@ use crate::env::{KnownReward, Spec};
 use crate::error::Result;
 use crate::nn::ops;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3, copy_parameters, device,
-    polyak, tensor, values,
+    Activation, Adam, AdamConfig, Grad, GroupLasso, Init, Mlp, MlpConfig, Norm, SquashedGaussian, Tensor3,
+    copy_parameters, device, polyak, tensor, values,
 };
 use crate::replay::{Batch, ReplayBuffer};
 use crate::rng::{self, Rng};
@@ -83,6 +83,8 @@ pub struct Sac {
     target_critics: Mlp,
     policy_optimiser: Adam,
     critic_optimiser: Adam,
+    /// On the inputs of the policy, and of the critics.
+    lassos: Option<[GroupLasso; 2]>,
     temperature: Temperature,
     replay: ReplayBuffer,
     hindsight: Option<Hindsight>,
@@ -146,6 +148,10 @@ impl Sac {
             norm: if config.layer_norm { Norm::Layer } else { Norm::None },
             ..policy.clone()
         };
+        let lassos = inputs.lasso(config.lasso).map(|features| {
+            let with_action = [&features[..], &vec![0.0; action_size]].concat();
+            [features, with_action].map(|coefficients| GroupLasso { coefficients })
+        });
         let policy = Mlp::new(&cpu, &policy, &mut rng);
         let critics = Mlp::new(&cpu, &critics, &mut rng);
         // A copy with tensors of its own.
@@ -155,6 +161,7 @@ impl Sac {
             Adam::new(AdamConfig { max_norm: config.max_gradient_norm, ..AdamConfig::new(config.learning_rate) });
         Ok(Self {
             inputs,
+            lassos,
             discount: config.discount_for(spec.horizon),
             action_size,
             policy,
@@ -230,6 +237,9 @@ impl Sac {
         let critic_loss = loss.array();
         let mut gradients = loss.backward();
         let norm = self.critic_optimiser.step(&mut self.critics, &mut gradients);
+        if let Some([_, lasso]) = &self.lassos {
+            lasso.step(&mut self.critics, self.config.learning_rate);
+        }
         polyak(&mut self.target_critics, &self.critics, self.config.polyak);
         Losses::from([("critic_loss", critic_loss), ("critic_gradient", norm), ("q", mean_q)])
     }
@@ -251,6 +261,9 @@ impl Sac {
         let policy_loss = loss.array();
         let mut gradients = loss.backward();
         let norm = self.policy_optimiser.step(&mut self.policy, &mut gradients);
+        if let Some([lasso, _]) = &self.lassos {
+            lasso.step(&mut self.policy, self.config.learning_rate);
+        }
 
         let mean_log_pi = log_pis.iter().sum::<f32>() / log_pis.len() as f32;
         let entropy_gap = mean_log_pi + self.config.target_entropy * self.action_size as f32;

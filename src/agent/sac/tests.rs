@@ -1,6 +1,7 @@
 use super::*;
 use crate::agent::{Agent, Mode};
 use crate::env::Feature;
+use crate::replay::Transition;
 
 /// The correlation of an agent's successive actions at one observation, in 40 episodes of 50 steps.
 fn correlation(config: SacConfig) -> f64 {
@@ -29,4 +30,30 @@ fn coloured_actions_persist() {
         let [white, pink] = [white, pink].map(correlation);
         assert!(white.abs() < 0.1 && pink > 0.4, "{what}: {white:.2} white, {pink:.2} pink");
     }
+}
+
+/// A strong group lasso, and a single update.
+#[test]
+fn a_group_lasso_leaves_differences_and_actions() {
+    let features = [Feature::new("x"), Feature::new("goal").constant(), Feature::new("way").difference("goal", "x")];
+    let spec = Spec::new("line", features, 1, 50, 0.1);
+    let config = SacConfig { hidden: vec![8], latent_features: true, lasso: 1e3, ..SacConfig::default() };
+    let mut agent = Sac::new(&spec, SacConfig { learning_rate: 0.1, ..config }, 0).expect("usable settings");
+    agent.replay.push(&Transition {
+        obs: vec![0.0, 0.5, 0.5],
+        action: vec![0.1],
+        reward: 0.0,
+        next_obs: vec![0.1, 0.5, 0.4],
+        terminated: false,
+        truncated: false,
+    });
+    agent.learn();
+    let zero = |network: &Mlp, input: usize| {
+        let (weight, bias) = network.layers_of(0).next().expect("a layer");
+        weight[input * bias.len()..][..bias.len()].iter().all(|w| *w == 0.0)
+    };
+    // The inputs: x and way; way, magnified; for the critics, the action.
+    assert_eq!([0, 1, 2].map(|input| zero(&agent.policy, input)), [true, false, false]);
+    assert_eq!([0, 1, 2, 3].map(|input| zero(&agent.critics, input)), [true, false, false, false]);
+    assert!(Sac::new(&spec, SacConfig { lasso: 1.0, ..SacConfig::default() }, 0).is_err(), "it needs latent features");
 }

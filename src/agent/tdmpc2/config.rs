@@ -48,6 +48,11 @@ pub struct TdMpc2Config {
     pub learning_rate: f32,
     /// The encoder's step size, as a fraction of the others'.
     pub encoder_rate: f32,
+    /// Group lasso on the encoder's inputs, except differences, such as the vector from the hand to a goal: each step shortens
+    /// the weights that leave an input, as one vector, by `learning_rate * lasso`. See
+    /// [`EnsembleConfig::reward_lasso`](crate::model::EnsembleConfig::reward_lasso).
+    #[doc(alias = "group lasso")]
+    pub lasso: f32,
     /// Gradients of the model, and of the policy, with a larger global norm are scaled down to it.
     pub max_gradient_norm: f32,
     /// Rate at which the target critics follow the critics, per update.
@@ -78,6 +83,7 @@ impl Default for TdMpc2Config {
             n_step: 1,
             learning_rate: 3e-4,
             encoder_rate: 0.3,
+            lasso: 0.0,
             max_gradient_norm: 20.0,
             target_rate: 0.01,
             entropy: 1e-4,
@@ -109,6 +115,7 @@ ranges!(TdMpc2Config {
     n_step: 1..=1000,
     learning_rate: 0.0..=1.0,
     encoder_rate: 0.0..=1e3,
+    lasso: 0.0..=1e3,
     max_gradient_norm: 1e-6..=1e9,
     target_rate: 0.0..=1.0,
     entropy: 0.0..=1e6,

@@ -36,6 +36,7 @@ impl TdMpc2 {
         losses.insert("targets_beyond_bins", beyond as f32 / targets.len() as f32);
         let mut gradients = ops::total(tape, &weighted).backward();
         losses.insert("model_gradient", self.model_optimiser.step(&mut networks.model, &mut gradients));
+        networks.model.select_inputs(config.learning_rate, config.lasso);
 
         // The policy, on latent states that are data to it.
         let latents = NoneTape.stack(&loss.latents);

@@ -9,7 +9,7 @@ use super::EnsembleConfig;
 use super::data::{Data, Schedule};
 use super::networks::{Learner, Member, Networks};
 use crate::nn::frozen::FrozenMlp;
-use crate::nn::{Activation, Grad, Tensor3, bounded_nll, ops, values};
+use crate::nn::{Activation, Grad, GroupLasso, Tensor3, bounded_nll, ops, values};
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
 
@@ -140,7 +140,7 @@ impl Networks {
                 minibatches.push(schedule.next(batch, rng));
             }
         }
-        let (gated, lasso) = (self.gated, &self.lasso);
+        let (gated, lasso) = (self.gated, self.lasso.as_ref());
         let members = self.members.par_iter_mut().zip(minibatches);
         let losses: Vec<f64> = members
             .map(|(member, minibatches)| {
@@ -203,16 +203,15 @@ impl Member {
         rows: &[usize],
         learning_rate: f32,
         gated: bool,
-        lasso: &[f32],
+        lasso: Option<&GroupLasso>,
         config: &EnsembleConfig,
     ) -> f32 {
         let loss = self.learner.nll(data.inputs_of(rows).leaky_traced(), &data.targets_of(rows), gated, config);
         let value = values(&loss)[0];
         self.optimiser.set_learning_rate(learning_rate);
         self.optimiser.step(&mut self.learner, &mut loss.sum().backward());
-        if !lasso.is_empty() {
-            let thresholds: Vec<f32> = lasso.iter().map(|coefficient| learning_rate * coefficient).collect();
-            self.learner.network.shrink_inputs(&thresholds);
+        if let Some(lasso) = lasso {
+            lasso.step(&mut self.learner.network, learning_rate);
         }
         value
     }

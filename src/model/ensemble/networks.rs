@@ -5,7 +5,8 @@ use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::model::Normaliser;
 use crate::nn::{
-    Activation, Adam, AdamConfig, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, device, parameters_of_fields,
+    Activation, Adam, AdamConfig, GroupLasso, Init, LogVarianceBounds, Mlp, MlpConfig, Norm, device,
+    parameters_of_fields,
 };
 use crate::rng::Rng;
 
@@ -21,8 +22,8 @@ pub(super) struct Networks {
     pub elites: Vec<usize>,
     /// Whether each mean is multiplied by a gate.
     pub gated: bool,
-    /// The coefficient of each input in a group lasso; none at all without one.
-    pub lasso: Vec<f32>,
+    /// A group lasso on their inputs.
+    pub lasso: Option<GroupLasso>,
 }
 
 impl Networks {
@@ -57,7 +58,7 @@ impl Networks {
             temperature: vec![1.0; outputs],
             elites: (0..config.elites).collect(),
             gated,
-            lasso: Vec::new(),
+            lasso: None,
         }
     }
 }

@@ -13,6 +13,7 @@ use crate::checkpoint::Weights;
 use crate::env::{KnownReward, Spec};
 use crate::error::Result;
 use crate::model::{LatentFeatures, Normaliser};
+use crate::nn::GroupLasso;
 use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
 use crate::nn::two_hot::{symexp, symlog};
 use crate::replay::ReplayBuffer;
@@ -39,9 +40,7 @@ impl RewardModel {
     pub fn new(spec: &Spec, config: &EnsembleConfig, rng: &mut Rng) -> Self {
         let inputs = Inputs { features: LatentFeatures::new(spec), actions: spec.action_size };
         let mut networks = Networks::new(config, [inputs.width(), 1], &config.reward_hidden, false, rng);
-        if config.reward_lasso > 0.0 && inputs.features.differences().any(|difference| difference) {
-            networks.lasso = inputs.lasso(config.reward_lasso);
-        }
+        networks.lasso = inputs.lasso(config.reward_lasso);
         Self { networks, inputs, unit: config.reward_unit, range: [0.0; 2] }
     }
 
@@ -116,11 +115,10 @@ impl Inputs {
         2 * self.features.width() + self.actions
     }
 
-    /// The coefficient of each input: 0 for differences.
-    fn lasso(&self, coefficient: f32) -> Vec<f32> {
-        let features = self.features.differences().map(|difference| if difference { 0.0 } else { coefficient });
-        let features: Vec<f32> = features.collect();
-        [&features, &vec![coefficient; self.actions], &features].into_iter().flatten().copied().collect()
+    /// The group lasso of [`EnsembleConfig::reward_lasso`].
+    fn lasso(&self, coefficient: f32) -> Option<GroupLasso> {
+        let features = self.features.lasso(coefficient)?;
+        Some(GroupLasso { coefficients: [&features[..], &vec![coefficient; self.actions], &features].concat() })
     }
 
     /// Appends the inputs of a transition: observation, action, next observation.

@@ -63,9 +63,12 @@ impl LatentFeatures {
         self.raw.len() + self.near.len()
     }
 
-    /// Whether each encoder input comes from a difference.
-    pub(crate) fn differences(&self) -> impl Iterator<Item = bool> {
-        self.raw.iter().chain(&self.near).map(|feature| self.near.contains(feature))
+    /// Coefficients of a [group lasso](crate::nn::GroupLasso) on the encoder inputs: 0 for differences. None if nothing is to be
+    /// penalised, or no feature is a difference.
+    pub(crate) fn lasso(&self, coefficient: f32) -> Option<Vec<f32>> {
+        let coefficient_of = |feature| if self.near.contains(feature) { 0.0 } else { coefficient };
+        let penalised = coefficient > 0.0 && !self.near.is_empty();
+        penalised.then(|| self.raw.iter().chain(&self.near).map(coefficient_of).collect())
     }
 
     /// Features in an observation.

@@ -49,7 +49,7 @@ use super::features::LatentFeatures;
 use crate::env::Spec;
 use crate::error::Result;
 use crate::nn::simnorm::sim_norm;
-use crate::nn::{Activation, Grad, Mlp, SymlogBins, TapeOps, Tensor3, device, parameters_of_fields};
+use crate::nn::{Activation, Grad, GroupLasso, Mlp, SymlogBins, TapeOps, Tensor3, device, parameters_of_fields};
 use crate::rng::Rng;
 use crate::settings::{Ranges, must_hold};
 
@@ -128,6 +128,13 @@ impl ImplicitModel {
     /// The features of observations that it reads.
     pub fn features(&self) -> &LatentFeatures {
         &self.features
+    }
+
+    /// The proximal step of a [`GroupLasso`] on the encoder's inputs except differences, after a gradient step.
+    pub fn select_inputs(&mut self, learning_rate: f32, coefficient: f32) {
+        if let Some(coefficients) = self.features.lasso(coefficient) {
+            GroupLasso { coefficients }.step(&mut self.encoder, learning_rate);
+        }
     }
 
     /// The ensemble of Q functions: from `[z, a]` to logits `[critics, rows, bins]`.
