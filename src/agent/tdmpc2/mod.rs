@@ -14,7 +14,7 @@
 //! The model is in [`crate::model::implicit`], the planner in [`crate::plan`]; an update is in `update.rs`. Deviations: no
 //! dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
 //! observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
-//! action are averaged, not summed; sizes for two cores. Optional: n-step targets, coloured noise for exploration, executing the
+//! action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, n-step targets, coloured noise for exploration, executing the
 //! mean of a plan, always or in evaluations.
 
 mod checkpoint;
