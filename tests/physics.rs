@@ -395,17 +395,18 @@ fn pressed_in(task: Task, seed: u64) -> f64 {
 
 /// As many control steps of pressing as an earlier version was tried with: there, a cube sank by up to 32 mm.
 #[test]
-fn cubes_are_hardly_pressed_into_the_table() {
+fn no_cube_is_pressed_into_the_table() {
     let episodes: Vec<(Task, u64)> = [Task::Lift, Task::Stack, Task::Push]
         .into_iter()
         .flat_map(|task| (0..38).map(move |seed| (task, seed)))
         .collect();
     let mut depths: Vec<f64> = episodes.into_par_iter().map(|(task, seed)| pressed_in(task, seed)).collect();
     depths.sort_by(f64::total_cmp);
-    // At most 2.1 mm with 20 shakes; but with another (36654), a cube of `stack` was pressed in by 11.7 mm.
-    let [second, worst] = [2, 1].map(|from_last| 1e3 * depths[depths.len() - from_last]);
-    println!("pressed in by {worst:.2} mm, in all other episodes by {second:.2} mm at most");
-    assert!(second < 3.0 && worst < 20.0, "pressed in by {second:.2} and {worst:.2} mm");
+    // Over 72,000 control steps, with five shakes, it was 1.9 mm. Known to fail with HANDFUL_SHAKE=36654: a cube of `stack`
+    // (seed 37) is pressed in by 11.7 mm, for a cause not yet found.
+    let worst = 1e3 * depths[depths.len() - 1];
+    println!("pressed in by {worst:.2} mm");
+    assert!(worst < 3.0, "pressed in by {worst:.2} mm");
 }
 
 /// Friction carries what the pads can carry, and no more: a cube falls out of a hand at rest with the acceleration
