@@ -45,16 +45,18 @@ fn sac_swings_the_pendulum_up() {
         batch: 128,
         learning_rate: 2e-3,
         temperature_rate: 2e-3,
+        n_step: 3,
         ..SacConfig::default()
     };
     let mut agent = Sac::new(env.spec(), config, 0).expect("usable settings");
-    for seed in 0..30 {
+    for seed in 0..40 {
         episode(&mut env, &mut agent, seed);
     }
     let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
     let summary = evaluator.evaluate(&mut agent, 20, EvalSeeds::Test).expect("valid actions").summary();
-    // Random torques earn about -1200; of twenty seeds, eighteen earned more than -250, the others -308 and -319.
-    assert!(summary.return_mean > -450.0, "mean return {}", summary.return_mean);
+    // Random torques earn about -1200; the worst of a hundred seeds earned -236. (After 30 episodes, and with returns of one step,
+    // three of fifty-one earned less than -450.)
+    assert!(summary.return_mean > -400.0, "mean return {}", summary.return_mean);
 }
 
 /// After one random episode the model is good enough to plan in: the next return makes up for most of the distance to the

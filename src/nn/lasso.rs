@@ -4,8 +4,8 @@ use dfdx::prelude::HasShape;
 
 use super::{Mlp, values_mut};
 
-/// A penalty on the length of the vector of weights that leave an input, for each input of a network. Other than weight decay, it
-/// makes the weights of inputs that are not needed zero.
+/// A penalty on the length of the vector of weights that leave an input, for each input of a network. Unlike weight decay, it
+/// makes the weights of inputs that are not needed exactly zero.
 #[doc(alias = "feature selection")]
 #[derive(Clone, Debug)]
 pub struct GroupLasso {
@@ -14,8 +14,8 @@ pub struct GroupLasso {
 }
 
 impl GroupLasso {
-    /// Its proximal step, after a gradient step of this learning rate: the vector of weights that leave input `i` loses
-    /// `learning_rate * coefficients[i]` of its length, or becomes zero.
+    /// Its proximal step, after a gradient step of this learning rate: the vector of weights that leave input `i` becomes
+    /// shorter by `learning_rate * coefficients[i]`, or zero.
     ///
     /// # Panics
     /// If there is not one coefficient for each input.
@@ -26,8 +26,9 @@ impl GroupLasso {
         assert_eq!(self.coefficients.len(), inputs, "one coefficient for each input");
         let rows = values_mut(weight).chunks_exact_mut(outputs).zip(self.coefficients.iter().cycle());
         for (row, coefficient) in rows.filter(|(_, coefficient)| **coefficient > 0.0) {
-            let (loss, norm) = (learning_rate * coefficient, row.iter().map(|w| w * w).sum::<f32>().sqrt());
-            let kept = if norm > loss { 1.0 - loss / norm } else { 0.0 };
+            let threshold = learning_rate * coefficient;
+            let norm = row.iter().map(|w| w * w).sum::<f32>().sqrt();
+            let kept = if norm > threshold { 1.0 - threshold / norm } else { 0.0 };
             row.iter_mut().for_each(|w| *w *= kept);
         }
     }

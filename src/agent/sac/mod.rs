@@ -7,10 +7,11 @@
 //!
 //! Deviations: log standard deviations are squashed into [-5, 2] as in CleanRL; the temperature's loss is
 //! -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
-//! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; inputs may have a group
-//! lasso; truncated episodes are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the mean of the critics for the policy
-//! where we take the smallest); goals may be relabelled in hindsight; the policy may explore with coloured noise, and may be
-//! updated less often than the critics; an action may be held for several time steps; gradients may be clipped.
+//! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; inputs may have a
+//! group lasso; truncated episodes are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the
+//! mean of the critics for the policy where we take the smallest); goals may be relabelled in hindsight; the policy may explore
+//! with coloured noise, and may be updated less often than the critics; an action may be held for several time steps; gradients
+//! may be clipped.
 
 mod acting;
 mod backup;

@@ -131,7 +131,7 @@ impl ImplicitModel {
     }
 
     /// The proximal step of a [`GroupLasso`] on the encoder's inputs except differences, after a gradient step.
-    pub fn select_inputs(&mut self, learning_rate: f32, coefficient: f32) {
+    pub(crate) fn select_inputs(&mut self, learning_rate: f32, coefficient: f32) {
         if let Some(coefficients) = self.features.lasso(coefficient) {
             GroupLasso { coefficients }.step(&mut self.encoder, learning_rate);
         }
