@@ -33,7 +33,8 @@ impl Diagnostics for TdMpc2 {
             let q = model.values(model.critics(), &z, &policy.mode(&z));
             let steps = episode.observations.len();
             let critics = q.len() / steps;
-            let mean = |t: usize| (0..critics).map(|i| q[i * steps + t]).sum::<f32>() / critics as f32;
+            let unit = self.config.reward_unit;
+            let mean = |t: usize| unit * (0..critics).map(|i| q[i * steps + t]).sum::<f32>() / critics as f32;
             let values: Vec<f32> = (0..steps).map(mean).collect();
             ValueEstimate::of_episode(&values, episode, self.discount)
         };

@@ -44,6 +44,11 @@ pub struct TdMpc2Config {
     /// discount) times 1 / `target_rate` updates to become those of far rewards; with n steps, n times fewer.
     #[doc(alias = "multi-step return")]
     pub n_step: usize,
+    /// Rewards are learned as multiples of this, and so are values. The bins next to zero lie at about the unit times `bin_limit /
+    /// (bins / 2)`; of rewards much smaller than that, little is learned. The policy's loss and the planner's temperature suit values
+    /// of one unit or more.
+    #[doc(alias = "reward scale")]
+    pub reward_unit: f32,
     /// Step size (Adam).
     pub learning_rate: f32,
     /// The encoder's step size, as a fraction of the others'.
@@ -81,6 +86,7 @@ impl Default for TdMpc2Config {
             replay: 1_000_000,
             discount: None,
             n_step: 1,
+            reward_unit: 1.0,
             learning_rate: 3e-4,
             encoder_rate: 0.3,
             lasso: 0.0,
@@ -113,6 +119,7 @@ ranges!(TdMpc2Config {
     replay: 2..=100_000_000,
     discount: 0.0..=1.0,
     n_step: 1..=1000,
+    reward_unit: 1e-9..=1e9,
     learning_rate: 0.0..=1.0,
     encoder_rate: 0.0..=1e3,
     lasso: 0.0..=1e3,

@@ -14,8 +14,8 @@
 //! The model is in [`crate::model::implicit`], the planner in [`crate::plan`]; an update is in `update.rs`. Deviations: no
 //! dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
 //! observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
-//! action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, n-step targets, coloured noise for exploration, executing the
-//! mean of a plan, always or in evaluations.
+//! action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, another unit of rewards,
+//! n-step targets, coloured noise for exploration, executing the mean of a plan, always or in evaluations.
 
 mod checkpoint;
 mod config;
@@ -234,7 +234,7 @@ impl Agent for TdMpc2 {
         let width = slot.obs.len();
         let trajectories = returns.iter().enumerate().map(|(i, value)| ImaginedTrajectory {
             observations: futures.iter().map(|rows| rows[i * width..][..width].to_vec()).collect(),
-            value: *value,
+            value: *value * self.config.reward_unit,
             disagreement: 0.0,
         });
         (action, trajectories.collect())
@@ -242,7 +242,10 @@ impl Agent for TdMpc2 {
 
     fn observe(&mut self, transition: &Transition) {
         match self.decision.join(transition, self.config.action_repeat) {
-            Some(Over::Whole(decision)) => self.replay.push(&decision),
+            Some(Over::Whole(mut decision)) => {
+                decision.reward /= self.config.reward_unit;
+                self.replay.push(&decision);
+            }
             Some(Over::Short(obs)) => self.replay.close(&obs, false),
             None => {}
         }

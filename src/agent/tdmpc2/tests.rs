@@ -2,11 +2,13 @@ use dfdx::prelude::*;
 use dfdx::tensor::Gradients;
 
 use super::*;
-use crate::env::Feature;
+use crate::agent::Diagnostics;
+use crate::env::{Feature, Task};
 use crate::model::ImplicitConfig;
 use crate::nn::two_hot::symexp;
 use crate::nn::{Parameters, TapeOps, Tensor3, device, ops, values, values_mut};
-use crate::replay::SequenceBatch;
+use crate::plan::GuidedConfig;
+use crate::replay::{Episode, SequenceBatch};
 
 const O: usize = 4;
 const A: usize = 2;
@@ -178,6 +180,44 @@ fn a_decision_that_was_cut_short_is_not_learned_from() {
         assert!(batch.obs[rows.clone()] == [obs; 20] && batch.rewards[rows.clone()] == [reward; 20]);
         assert_eq!(batch.last[rows], [t == 2; 20]);
     }
+}
+
+/// An agent that counts quarter rewards in quarters learns and plans as one that counts whole rewards, and its estimates are in
+/// the unit of the rewards.
+#[test]
+fn rewards_are_multiples_of_their_unit() {
+    let spec = Spec::new("walk", [Feature::new("place")], 1, 8, 0.05);
+    let [mut whole, mut quarters] = [1.0, 0.25].map(|reward_unit| {
+        let planner =
+            GuidedConfig { population: 16, proposals: 4, elites: 4, iterations: 2, ..GuidedConfig::default() };
+        let config = TdMpc2Config { reward_unit, batch: 4, warm_up: 8, planner, ..TdMpc2Config::default() };
+        let mut agent = TdMpc2::new(&spec, config, 0).expect("usable settings");
+        let mut actions = Vec::<f32>::new();
+        for i in 0..16_u8 {
+            let (obs, place) = (vec![f32::from(i % 8)], f32::from(i % 8 + 1));
+            let action = agent.act(&obs, Mode::Explore);
+            let (reward, next_obs) = (reward_unit * place * action[0], vec![place]);
+            actions.extend(&action);
+            agent.observe(&Transition { obs, action, reward, next_obs, terminated: false, truncated: i % 8 == 7 });
+            agent.update();
+        }
+        (agent, actions)
+    });
+    assert_eq!(whole.1, quarters.1);
+    let slot = Slot { index: 0, first: true, obs: &[3.0], env: &Task::Pendulum.make() };
+    let [planned, planned_quarters] = [&mut whole, &mut quarters].map(|(agent, _)| agent.act_and_explain(&slot));
+    assert_eq!(planned.0, planned_quarters.0);
+    assert!(planned.1.iter().zip(&planned_quarters.1).all(|(one, quarter)| quarter.value == 0.25 * one.value));
+    let episode = |rewards: Vec<f32>| Episode {
+        observations: vec![vec![0.0], vec![1.0]],
+        actions: vec![vec![0.5]],
+        rewards,
+        terminated: false,
+    };
+    let [one, quarter] = [(&whole.0, 1.0), (&quarters.0, 0.25)]
+        .map(|(agent, reward)| agent.value_estimates(&[episode(vec![reward])])[0]);
+    assert_ne!(one.expected, 0.0);
+    assert_eq!((quarter.expected, quarter.realised), (0.25 * one.expected, 0.25 * one.realised));
 }
 
 /// The mean of a plan is executed in evaluations, and the search, and exploration, are the same.

@@ -13,10 +13,10 @@ use crate::rng::Rng;
 
 impl TdMpc2 {
     /// One update on freshly drawn slices of `horizon` steps; `None` while no episode is that long. Returns the means of
-    /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `target`, the mean value target, and
-    /// `targets_beyond_bins`, the share of targets that no bin holds (more than a few: raise `bin_limit`); `q`, the mean value of
-    /// the policy's actions; `latent_drift` ([`drift`](crate::model::ImplicitLoss::drift)); `value_scale`; and the norms of the
-    /// gradients before clipping.
+    /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `target`, the mean value target, `q`, the mean value of the
+    /// policy's actions, and `value_scale`, all three in multiples of [`TdMpc2Config::reward_unit`](super::TdMpc2Config::reward_unit);
+    /// `targets_beyond_bins`, the share of targets that no bin holds (more than a few: raise `bin_limit`); `latent_drift`
+    /// ([`drift`](crate::model::ImplicitLoss::drift)); and the norms of the gradients before clipping.
     pub fn learn(&mut self) -> Option<Losses> {
         let Self { config, networks, scale, discount, replay, rng, .. } = self;
         let batch = replay.sample_within_episodes(config.batch, config.horizon + 1, rng)?;
