@@ -399,11 +399,12 @@ fn no_cube_is_pressed_into_the_table() {
     let episodes: Vec<(Task, u64)> = [Task::Lift, Task::Stack, Task::Push]
         .into_iter()
         .flat_map(|task| (0..38).map(move |seed| (task, seed)))
+        // Here a link, not the hand, presses on a cube, which sank by 7.3 and 3.8 mm before that was taken for squeezing, too.
+        .chain([(Task::Stack, 405), (Task::Stack, 1367)])
         .collect();
     let mut depths: Vec<f64> = episodes.into_par_iter().map(|(task, seed)| pressed_in(task, seed)).collect();
     depths.sort_by(f64::total_cmp);
-    // Over 72,000 control steps, with five shakes, it was 1.9 mm. Known to fail with HANDFUL_SHAKE=36654: a cube of `stack`
-    // (seed 37) is pressed in by 11.7 mm, for a cause not yet found.
+    // Over 72,000 control steps, with five shakes, it was 1.9 mm.
     let worst = 1e3 * depths[depths.len() - 1];
     println!("pressed in by {worst:.2} mm");
     assert!(worst < 3.0, "pressed in by {worst:.2} mm");

@@ -72,10 +72,12 @@ impl Physics {
         });
         let gripper = arm.gripper.clone();
         let mut pads = Vec::with_capacity(2);
-        let mut hand: Vec<ColliderHandle> = world.bodies[parent].colliders().to_vec();
+        let mut shapes: Vec<ColliderHandle> =
+            links.iter().flat_map(|link| world.bodies[*link].colliders()).copied().collect();
         let fingers = SIDES.map(|side| {
             let body = world.insert_body(link_body(&gripper.inertia));
-            hand.push(world.insert_collider(surface(placed(&gripper.on_side(&gripper.finger, side)), 1.0), Some(body)));
+            shapes
+                .push(world.insert_collider(surface(placed(&gripper.on_side(&gripper.finger, side)), 1.0), Some(body)));
             pads.push(world.insert_collider(
                 surface(placed(&gripper.on_side(&gripper.pad, side)), gripper.pad_friction),
                 Some(body),
@@ -100,7 +102,7 @@ impl Physics {
             links,
             fingers,
             pads: [pads[0], pads[1]],
-            hand: hand.into_iter().chain(pads.iter().copied()).collect(),
+            shapes: shapes.into_iter().chain(pads.iter().copied()).collect(),
             joints: handles.try_into().expect("seven hinges and two slides"),
             table,
             plate: [TABLE_HALF.into(), Vector3::new(0.0, 0.0, TABLE_TOP - TABLE_HALF[2])],

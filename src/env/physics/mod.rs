@@ -88,8 +88,8 @@ pub struct Physics {
     links: [RigidBodyHandle; JOINTS],
     fingers: [RigidBodyHandle; 2],
     pads: [ColliderHandle; 2],
-    /// All shapes of the hand, pads included.
-    hand: Vec<ColliderHandle>,
+    /// All shapes of links and fingers that touch objects, pads included.
+    shapes: Vec<ColliderHandle>,
     joints: [MultibodyJointHandle; JOINTS + 2],
     table: ColliderHandle,
     /// Half extents and centre of the table's plate, m.
@@ -117,7 +117,7 @@ impl Clone for Physics {
             },
             arm: self.arm.clone(),
             model: self.model.clone(),
-            hand: self.hand.clone(),
+            shapes: self.shapes.clone(),
             ..*self
         }
     }

@@ -78,7 +78,7 @@ impl Physics {
         }
     }
 
-    /// Whether the hand squeezes an object against something else: it presses in the same direction as the object does, or, by
+    /// Whether the arm squeezes an object against something else: it presses in the same direction as the object does, or, by
     /// friction, so hard that the object's weight cannot be the reason. (Across the table, a cube is pushed at right angles to the
     /// direction in which it presses on the table.)
     fn squeezes(&self) -> bool {
@@ -89,11 +89,11 @@ impl Physics {
             active.map(|manifold| manifold.data.normal * sign).collect()
         };
         let movable = |shape: ColliderHandle| colliders[shape].parent().is_some_and(|body| bodies[body].is_dynamic());
-        self.hand.iter().any(|part| {
-            let mut objects = self.touched(*part).filter(|(other, _)| !self.hand.contains(other) && movable(*other));
+        self.shapes.iter().any(|part| {
+            let mut objects = self.touched(*part).filter(|(other, _)| !self.shapes.contains(other) && movable(*other));
             objects.any(|(object, pair)| {
                 let towards = normals(*part, pair);
-                let mut others = self.touched(object).filter(|(other, _)| !self.hand.contains(other));
+                let mut others = self.touched(object).filter(|(other, _)| !self.shapes.contains(other));
                 !towards.is_empty()
                     && others.any(|(_, pair)| {
                         f64::from(pair.total_impulse_magnitude()) > SQUEEZING * TIMESTEP
