@@ -502,11 +502,15 @@ fn at(x: f32, goal: f32) -> Vec<f32> {
     vec![x, goal, goal - x]
 }
 
+/// A point on a line, and a goal.
+fn line() -> Spec {
+    let features = [Feature::new("x"), Feature::new("goal").constant(), Feature::new("way").difference("goal", "x")];
+    Spec::new("line", features, 1, 50, 0.1)
+}
+
 /// An ensemble that has learned the reward, minus the distance to the goal, from 2000 transitions with these goals; and the
 /// transitions.
 fn with_goals(goals: &[f32], config: EnsembleConfig) -> (Ensemble, ReplayBuffer) {
-    let features = [Feature::new("x"), Feature::new("goal").constant(), Feature::new("way").difference("goal", "x")];
-    let spec = Spec::new("line", features, 1, 50, 0.1);
     let mut rng = rng::stream(0, "goals");
     let mut data = ReplayBuffer::new(3, 1, 2000);
     for goal in goals.iter().cycle().take(2000) {
@@ -522,7 +526,7 @@ fn with_goals(goals: &[f32], config: EnsembleConfig) -> (Ensemble, ReplayBuffer)
         });
     }
     let config = EnsembleConfig { learn_reward: true, ..config };
-    let mut ensemble = Ensemble::new(&spec, config, &mut rng).expect("usable settings");
+    let mut ensemble = Ensemble::new(&line(), config, &mut rng).expect("usable settings");
     assert_eq!(ensemble.fit(&data, &mut rng).reward_errors.len(), ensemble.dynamics().members());
     (ensemble, data)
 }
@@ -582,6 +586,65 @@ fn with_a_group_lasso_a_learned_reward_depends_on_differences_alone() {
         moved = moved.max((here[1] - there[1]).abs());
     }
     assert!(moved > 1e-3, "without it, predictions depend on the place of the goal: {moved}");
+}
+
+/// A latent state that is not asked for places does not hold them, and still tells how far the goal is.
+#[test]
+fn with_a_group_lasso_latent_states_depend_on_differences_alone() {
+    let mut rng = rng::stream(0, "places");
+    let mut replay = SequenceReplay::new(3, 1, 2000);
+    for _ in 0..50 {
+        let [mut x, goal] = [0; 2].map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32);
+        for t in 0..20 {
+            let action = rng::uniform(&mut rng, -1.0, 1.0) as f32;
+            let next = x + 0.1 * action;
+            replay.push(&Transition {
+                obs: at(x, goal),
+                action: vec![action],
+                reward: -(goal - next).abs(),
+                next_obs: at(next, goal),
+                terminated: false,
+                truncated: t == 19,
+            });
+            x = next;
+        }
+    }
+    let rssm = RssmConfig { deter: 32, blocks: 1, hidden: 32, stoch: 8, classes: 8, unimix: 0.01 };
+    let mut latent_states = |lasso: f32| {
+        let config = WorldModelConfig {
+            rssm: rssm.clone(),
+            units: 32,
+            layers: 1,
+            bins: 41,
+            bin_limit: 5.0,
+            reconstruction: 10.0,
+            lasso,
+            ..WorldModelConfig::default()
+        };
+        let mut world = WorldModel::new(&line(), &config, &mut rng);
+        let mut optimiser = Adam::new(AdamConfig { warm_up: 50, ..AdamConfig::laprop(1e-3) });
+        for _ in 0..500 {
+            world.learn(&replay.sample(16, 8, &mut rng), &mut optimiser, &mut rng);
+        }
+        // Latent states drawn for an observation, and the mean of the ways that are decoded from them.
+        move |x: f32, goal: f32| {
+            const DRAWS: usize = 32;
+            let still = tensor(world.device(), vec![0.0; DRAWS], (1, DRAWS, 1));
+            let obs = at(x, goal).repeat(DRAWS);
+            let features = world.observe(&world.initial(DRAWS), &still, &obs, &mut rng::stream(0, "draws")).features();
+            let way = world.decode(&features).chunks(3).map(|obs| obs[2]).sum::<f32>() / DRAWS as f32;
+            (values(&features).to_vec(), way)
+        }
+    };
+    let (lasso, none) = (latent_states(10.0), latent_states(0.0));
+    let mut wrong = 0.0;
+    for way in [-0.75, -0.25, 0.125, 0.5] {
+        let [here, there] = [0.5, -0.125].map(|goal| lasso(goal - way, goal));
+        assert_eq!(here.0, there.0, "{way} from the goal, wherever it is");
+        wrong += (here.1 - way).abs() / 4.0;
+        assert_ne!(none(0.5 - way, 0.5).0, none(-0.125 - way, -0.125).0, "without it, they hold the place");
+    }
+    assert!(wrong < 0.2, "the way to the goal is known to {wrong}");
 }
 
 #[test]

@@ -115,6 +115,11 @@ impl Adam {
         self.steps.into()
     }
 
+    /// The step size after its warm-up.
+    pub fn learning_rate(&self) -> f32 {
+        self.config.learning_rate
+    }
+
     /// Changes the step size from the next step on.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.config.learning_rate = learning_rate;

@@ -67,6 +67,7 @@ impl Dreamer {
             }
         }
         losses.insert("gradient_norm", self.optimiser.step(&mut self.networks, &mut gradients));
+        self.networks.world.select_inputs(self.config.learning_rate);
         losses.insert("return_scale", scale);
         let Networks { behaviour, target, .. } = &mut self.networks;
         behaviour.update_target(target);
@@ -91,6 +92,7 @@ impl Networks {
 
         let mut losses = Losses::from(loss.means());
         losses.insert("replay_critic_loss", ops::mean(&replay_critic.1));
+        losses.extend(loss.probe.as_ref().map(|probe| ("probe_loss", ops::mean(probe))));
         losses.insert("posterior_entropy", loss.posterior_entropy);
         losses.insert("prior_entropy", loss.prior_entropy);
         let mut all = loss.weighted();

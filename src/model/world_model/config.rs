@@ -24,6 +24,12 @@ pub struct WorldModelConfig {
     pub free_nats: f32,
     /// Weight of the reconstruction loss. More than the published 1 makes small differences in observations count.
     pub reconstruction: f32,
+    /// Group lasso on the encoder's inputs, except differences, such as the vector from the hand to a goal: each step shortens
+    /// the weights that leave an input, as one vector, by `learning_rate * lasso`. See
+    /// [`EnsembleConfig::reward_lasso`](crate::model::EnsembleConfig::reward_lasso). Nor are latent states asked to reconstruct
+    /// these inputs: a probe that has no effect on them reads the inputs out of them as well as it can.
+    #[doc(alias = "group lasso")]
+    pub lasso: f32,
     /// Weight of the dynamics loss, [`Categorical::dynamics_kl`](crate::nn::Categorical::dynamics_kl).
     #[doc(alias = "KL balancing")]
     pub dynamics: f32,
@@ -45,6 +51,7 @@ impl Default for WorldModelConfig {
             bin_limit: 20.0,
             free_nats: 1.0,
             reconstruction: 1.0,
+            lasso: 0.0,
             dynamics: 1.0,
             representation: 0.1,
             discount_horizon: 333.0,
@@ -60,6 +67,7 @@ ranges!(WorldModelConfig {
     bin_limit: 0.1..=80.0,
     free_nats: 0.0..=1e3,
     reconstruction: 0.0..=1e6,
+    lasso: 0.0..=1e3,
     dynamics: 0.0..=1e3,
     representation: 0.0..=1e3,
     discount_horizon: 1.01..=1e6,

@@ -7,7 +7,7 @@ use super::{WorldModel, WorldModelConfig};
 use crate::model::Latent;
 use crate::nn::kernels::{sigmoid, softplus};
 use crate::nn::ops::{self, mean};
-use crate::nn::{Adam, Grad, TapeOps, Tensor3, tensor};
+use crate::nn::{Adam, Grad, TapeOps, Tensor3, tensor, values};
 use crate::replay::SequenceBatch;
 use crate::rng::Rng;
 
@@ -18,8 +18,10 @@ use crate::rng::Rng;
 #[derive(Clone, Debug)]
 pub struct WorldModelLoss {
     /// The squared error of the decoded observation, summed over its numbers, in the networks' units (symlog and scaled);
-    /// without the factor 1/2 of eq. 1, as in the published code.
+    /// without the factor 1/2 of eq. 1, as in the published code. Without the numbers that the probe reconstructs.
     pub reconstruction: Tensor3,
+    /// The same for the probe, if there is one ([`WorldModelConfig::lasso`]).
+    pub probe: Option<Tensor3>,
     /// The cross-entropy of the reward's two-hot distribution. At the first time step of an episode its target is 0, as in
     /// the published code, although a sequence that begins within an episode starts from the same blank state with a reward.
     /// Nothing reads the prediction there: imagined returns begin with the reward of the next state.
@@ -55,7 +57,8 @@ impl WorldModelLoss {
 
     /// The terms with their weights from [`WorldModelConfig`]: what [`ops::total`] sums up.
     pub fn weighted(&self) -> Vec<(f32, Tensor3)> {
-        self.weights.into_iter().zip(self.terms()).map(|(weight, (_, term))| (weight, term.clone())).collect()
+        let terms = self.weights.into_iter().zip(self.terms()).map(|(weight, (_, term))| (weight, term));
+        terms.chain(self.probe.iter().map(|loss| (1.0, loss))).map(|(weight, term)| (weight, term.clone())).collect()
     }
 
     /// The mean of each term over the batch, not weighted, under the name that logs use.
@@ -75,7 +78,11 @@ impl WorldModel {
         let features = tape.join(&latent.deter, &latent.stoch);
 
         let decoded = self.decoder.on(tape, &features, Grad::Both);
-        let reconstruction = tape.squared_distance(&decoded, &obs);
+        let reconstruction = self.reconstruction(tape, &decoded, &obs, false);
+        let probe = self.probe.as_ref().map(|probe| {
+            let probed = probe.on(tape, &features, Grad::Params);
+            self.reconstruction(tape, &probed, &obs, true)
+        });
         let reward_logits = self.reward.on(tape, &features, Grad::Both);
         let reward = self.bins.loss(tape, &reward_logits, &[&batch.rewards]);
         let continuation_logits = self.continuation.on(tape, &features, Grad::Both);
@@ -91,6 +98,7 @@ impl WorldModel {
             posterior_entropy: mean_entropy(&posterior),
             prior_entropy: mean_entropy(&prior),
             reconstruction,
+            probe,
             reward,
             continuation,
             dynamics,
@@ -99,6 +107,26 @@ impl WorldModel {
             latent,
             features,
         }
+    }
+
+    /// The squared error of decoded observations, over the inputs that are `penalised` by the lasso, or over the others.
+    fn reconstruction<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        decoded: &Tensor3,
+        obs: &Tensor3,
+        penalised: bool,
+    ) -> Tensor3 {
+        let (obs, width) = (values(obs), self.obs_features.width());
+        tape.rowwise(decoded, |row, decoded, slope| {
+            let mut squares = 0.0;
+            for i in (0..width).filter(|i| self.penalised(*i) == penalised) {
+                let error = decoded[i] - obs[row * width + i];
+                slope[i] = 2.0 * error;
+                squares += error * error;
+            }
+            squares
+        })
     }
 
     /// Binary cross-entropy with the discount as target (0 at terminal states): `softplus(logit) - target logit`.
@@ -116,6 +144,7 @@ impl WorldModel {
         let mut tape = OwnedTape::default();
         let loss = self.loss(&mut tape, batch, rng);
         optimiser.step(self, &mut ops::total(tape, &loss.weighted()).backward());
+        self.select_inputs(optimiser.learning_rate());
         loss.means()
     }
 

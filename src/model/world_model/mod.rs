@@ -54,7 +54,7 @@ use super::rssm::{Latent, Rssm};
 use crate::env::Spec;
 use crate::error::Result;
 use crate::nn::kernels::sigmoid;
-use crate::nn::{Grad, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values};
+use crate::nn::{Grad, GroupLasso, Mlp, SymexpBins, Tensor3, device, parameters_of_fields, tensor, values, values_mut};
 use crate::replay::Episode;
 use crate::rng::Rng;
 use crate::settings::{Ranges, must_hold};
@@ -71,14 +71,18 @@ pub struct WorldModel {
     cpu: Cpu,
     obs_features: LatentFeatures,
     bins: SymexpBins,
+    /// On the encoder's inputs; None if none is penalised.
+    lasso: Option<GroupLasso>,
     encoder: Mlp,
     rssm: Rssm,
     decoder: Mlp,
     reward: Mlp,
     continuation: Mlp,
+    /// Reconstructs the penalised inputs. No gradient flows from it into latent states.
+    probe: Option<Mlp>,
 }
 
-parameters_of_fields!(WorldModel: encoder, rssm, decoder, reward, continuation as "continues");
+parameters_of_fields!(WorldModel: encoder, rssm, decoder, reward, continuation as "continues", probe);
 
 impl WorldModel {
     /// A new model of environments with this specification.
@@ -106,16 +110,20 @@ impl WorldModel {
         let decoder = mlp(features, &hidden, Some(obs_features.width()));
         let reward = mlp(features, &hidden[..1], Some(config.bins)).scale_output(0.0);
         let continuation = mlp(features, &hidden[..1], Some(1));
+        let lasso = obs_features.lasso(config.lasso).map(|coefficients| GroupLasso { coefficients });
+        let probe = lasso.is_some().then(|| mlp(features, &hidden[..1], Some(obs_features.width())));
         Self {
             rssm: Rssm::new(&cpu, &config.rssm, spec.action_size, config.units, rng),
             obs_features,
             bins: SymexpBins::new(config.bins, config.bin_limit),
             config: config.clone(),
             cpu,
+            lasso,
             encoder,
             decoder,
             reward,
             continuation,
+            probe,
         }
     }
 
@@ -164,7 +172,26 @@ impl WorldModel {
 
     /// The observations that are predicted from features `[1, rows, features]`, in physical units: `[rows, observation]`.
     pub fn decode(&self, features: &Tensor3) -> Vec<f32> {
-        self.obs_features.decode(&self.decoder.forward(features.clone(), Grad::Input))
+        let mut decoded = self.decoder.forward(features.clone(), Grad::Input);
+        if let Some(probe) = &self.probe {
+            let probed = probe.forward(features.clone(), Grad::Input);
+            let numbers = values_mut(&mut decoded).iter_mut().zip(values(&probed)).enumerate();
+            let of_probe = numbers.filter(|(i, _)| self.penalised(i % self.obs_features.width()));
+            of_probe.for_each(|(_, (decoded, probed))| *decoded = *probed);
+        }
+        self.obs_features.decode(&decoded)
+    }
+
+    /// Whether an input of the encoder is penalised by the lasso.
+    fn penalised(&self, input: usize) -> bool {
+        self.lasso.as_ref().is_some_and(|lasso| lasso.coefficients[input] > 0.0)
+    }
+
+    /// The proximal step of the lasso, after a gradient step.
+    pub(crate) fn select_inputs(&mut self, learning_rate: f32) {
+        if let Some(lasso) = &self.lasso {
+            lasso.step(&mut self.encoder, learning_rate);
+        }
     }
 
     /// The predicted rewards for arriving in latent states with these features, `[rows]`.
