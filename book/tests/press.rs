@@ -105,29 +105,40 @@ fn numbers_from_studies_are_quoted_as_they_are() {
             ["success", "success_low", "success_high"].map(|column| 100.0 * in_study(study, task, method, column));
         format!("{rate:.0} % [{low:.0}, {high:.0}]")
     };
-    let quick = |method: &str, column: &str| in_study("quick", "reach", method, column);
     let reach = |method: &str, column: &str| in_study("reach", "reach", method, column);
+    let first = |method: &str, column: &str| in_study("first", "reach", method, column);
     let thousands = |steps: f64| match steps as usize {
         steps if steps < 1000 => steps.to_string(),
         steps => format!("{},{:03}", steps / 1000, steps % 1000),
     };
     let mut quotes: Vec<(&str, String)> = Vec::new();
-    for (name, method) in [("random", "random"), ("scripted (by hand)", "scripted")] {
-        let (success, sparc) = (success("quick", "reach", method), quick(method, "smoothness_sparc"));
-        quotes.push(("README.md", format!("| {name} | {success} | - | - | {sparc:.2} |")));
-    }
-    for (name, method, digits) in
-        [("PETS (knows the reward)", "pets", 1), ("Dreamer", "dreamer", 2), ("TD-MPC2", "tdmpc2", 1), ("SAC", "sac", 3)]
+    for (name, method) in
+        [("random", "random"), ("scripted (by hand)", "scripted"), ("oracle (plans on the true simulator)", "oracle")]
     {
-        let [steps, seconds, ms, sparc] =
-            ["steps_to_80", "seconds_to_80", "action_ms", "smoothness_sparc"].map(|column| quick(method, column));
-        let (success, steps) = (success("quick", "reach", method), thousands(steps));
-        let row = format!("| {name} | {success} | {steps}, after {seconds:.0} s | {ms:.digits$} | {sparc:.2} |");
-        quotes.push(("README.md", row));
+        let (success, sparc) = (success("reach", "reach", method), reach(method, "smoothness_sparc"));
+        quotes.push(("README.md", format!("| {name} | {success} | - | - | - | {sparc:.2} |")));
     }
-    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("pets", column));
-    quotes.push(("README.md", format!("SAC takes at least {ratio:.1} times as many (95 % interval from {low:.1})")));
-    quotes.push(("chapters/00-start.md", format!("needs at least {ratio:.1} times as many")));
+    for (name, method, digits) in [
+        ("PETS (knows the reward)", "pets", 1),
+        ("TD-MPC2", "tdmpc2", 1),
+        ("SAC", "sac", 3),
+        ("PETS (learns the reward)", "pets-learned", 1),
+        ("Dreamer", "dreamer", 2),
+    ] {
+        let [steps, ratio, low, high, ms, sparc] = [
+            "steps_to_80",
+            "sac_steps_ratio",
+            "sac_steps_ratio_t_low",
+            "sac_steps_ratio_t_high",
+            "action_ms",
+            "smoothness_sparc",
+        ]
+        .map(|column| reach(method, column));
+        let ratio = if method == "sac" { "1".into() } else { format!("{ratio:.1} [{low:.1}, {high:.1}]") };
+        let (success, steps) = (success("reach", "reach", method), thousands(steps));
+        quotes.push(("README.md", format!("| {name} | {success} | {steps} | {ratio} | {ms:.digits$} | {sparc:.2} |")));
+        assert_eq!(reach(method, "seeds_reaching_80"), 5.0);
+    }
     let lift = |method: &str, column: &str| in_study("lift", "lift", method, column);
     let [ratio, low, high] = ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"]
         .map(|column| format!("{:.1}", lift("pets", column)));
@@ -147,7 +158,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
             ),
         ),
         ("README.md", format!("PETS lifts in {pets} of the test episodes")),
-        ("README.md", format!("and lifts in {learned} after 20,000")),
+        ("README.md", format!("it lifted in {learned} after 20,000")),
         ("chapters/06-pets.md", both),
     ]);
     let reaching = ["pets", "sac", "tdmpc2", "dreamer", "pets-learned"].map(|method| lift(method, "seeds_reaching_80"));
@@ -181,28 +192,32 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("README.md", format!("as smoothly with PETS as with SAC (SPARC {:.1} and {:.1})", sparc[0], sparc[1])),
     ]);
     assert_eq!([push("pets", "seeds_reaching_80"), push("pets", "seeds")], [5.0, 5.0], "all seeds of PETS push");
-    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| reach("tdmpc2", column));
-    quotes.push(("README.md", format!("(SAC takes at least {ratio:.1} times as many, interval from {low:.1})")));
-    let tdmpc2 = format!("SAC takes at least {ratio:.1} times as many steps (95 % interval from {low:.1};");
-    quotes.push(("chapters/11-tdmpc2.md", tdmpc2));
-    assert_eq!([reach("tdmpc2", "seeds_reaching_80"), reach("tdmpc2", "steps_to_80")], [5.0, 1500.0]);
-    quotes.push((
-        "README.md",
-        format!("PETS reaches in {} of the test episodes", success("reach", "reach", "pets-learned")),
-    ));
+    let ratio = |method: &str| {
+        ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"].map(|column| reach(method, column))
+    };
+    let [times, low, high] = ratio("pets");
+    let pets = format!("needs {times:.1} times as many (t interval from {low:.1} to {high:.1})");
+    let [times, low, high] = ratio("tdmpc2");
+    let tdmpc2 = format!("SAC takes {times:.1} times as many steps (t interval from {low:.1} to {high:.1};");
+    let learned = format!("PETS reaches in {} of the test episodes", success("reach", "reach", "pets-learned"));
+    quotes.extend([("chapters/00-start.md", pets), ("chapters/11-tdmpc2.md", tdmpc2), ("README.md", learned)]);
     let pets = test_successes("reach", "reach", "pets");
     let (least, most) = (pets.iter().min().expect("seeds"), pets.iter().max().expect("seeds"));
-    quotes.push(("chapters/06-pets.md", format!("in {least} to {most} of its 100 test episodes after 3,000")));
-    let sac = 500.0 * reach("sac", "success");
+    let range = if least == most { format!("all {least}") } else { format!("{least} to {most}") };
+    quotes.push(("chapters/06-pets.md", format!("in {range} of their 100 test episodes after 3,000")));
+    let sac = 500.0 * first("sac", "success");
     quotes.push(("chapters/12-study.md", format!("SAC succeeded in {sac:.0} of 500 episodes")));
-    let [seeds, steps] = ["seeds_reaching_80", "steps_to_80"].map(|column| reach("dreamer", column));
-    assert_eq!(seeds, 4.0);
-    let dreamer =
-        format!("Four of five seeds of Dreamer are at 80 % within 3,000 steps, the median by {}", thousands(steps));
-    quotes.push(("chapters/10-dreamer.md", dreamer));
-    let steps = thousands(reach("sac", "steps_to_80"));
-    let sac = format!("Four of five seeds of SAC reach 80 % within 3,000 steps, the median by {steps}");
-    quotes.push(("chapters/08-sac.md", sac));
+    let median = |method: &str| thousands(reach(method, "steps_to_80"));
+    quotes.extend([
+        (
+            "chapters/10-dreamer.md",
+            format!("All five seeds of Dreamer are at 80 % within 3,000 steps, the median by {}", median("dreamer")),
+        ),
+        (
+            "chapters/08-sac.md",
+            format!("All five seeds of SAC are at 80 % within 1,000 steps, the median by {}", median("sac")),
+        ),
+    ]);
     for (file, quote) in quotes {
         let text = std::fs::read_to_string(root().join(file)).expect("a page");
         let text = text.split_whitespace().collect::<Vec<&str>>().join(" ");

@@ -7,7 +7,8 @@
 //! version. Deviations: there is one environment, the first actions are random (`warm_up`), the replay buffer is smaller, its
 //! sequences start with a latent state of zeros, new experience has no precedence in it, positions are seen as differences
 //! (`model/features/latent.rs`), and in evaluation the policy acts by its mean. Optional: rollouts from a part of the states
-//! (`dreams`), exploration with coloured noise. PlaNet has Gaussian states and the KL divergence in its loss once.
+//! (`dreams`), exploration with coloured noise, a group lasso on the encoder's inputs, with a probe that reconstructs what it
+//! prunes. PlaNet has Gaussian states and the KL divergence in its loss once.
 //!
 //! ```
 //! use handful::agent::dreamer::DreamerConfig;
