@@ -39,27 +39,43 @@ fn on_task(tables: &Tables, task: &str) -> Result<String> {
     Ok(format!("- **{task}**\n{}", points.concat()))
 }
 
-/// Which method reaches the level first, and which of those that are not told the reward.
+/// Which methods reach the level first, and which of those that are not told the reward.
 fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<String> {
     let mut medians: Vec<(f64, &str)> = Vec::new();
     for method in learning {
         medians.extend(tables.value(task, method, "steps_to_80")?.map(|steps| (steps, *method)));
     }
-    medians.sort_by(|a, b| a.0.total_cmp(&b.0));
     let level = 100.0 * LEVEL;
-    let Some((steps, first)) = medians.first() else {
+    let Some((steps, first)) = earliest(&medians) else {
         return Ok(format!("no method reaches {level:.0} % success in its median seed."));
     };
-    let told = |method: &&str| TOLD_THE_REWARD.contains(method);
-    let mut text = format!("`{first}` is first at {level:.0} % success, by step {steps:.0} (median).");
-    if told(first) {
-        text += &format!(" `{first}` is told the reward function;");
-        text += &match medians.iter().find(|(_, method)| !told(method)) {
-            Some((steps, method)) => format!(" of the methods that are not, `{method}` is first, by step {steps:.0}."),
+    let told = |method: &str| TOLD_THE_REWARD.contains(&method);
+    let mut text = format!("{} first at {level:.0} % success, by step {steps:.0} (median).", are(&first));
+    if let Some(informed) = first.iter().find(|method| told(method)) {
+        text += &format!(" `{informed}` is told the reward function;");
+        medians.retain(|(_, method)| !told(method));
+        text += &match earliest(&medians) {
+            Some((steps, first)) => format!(" of the methods that are not, {} first, by step {steps:.0}.", are(&first)),
             None => " no method that is not gets there in its median seed.".into(),
         };
     }
     Ok(text)
+}
+
+/// The smallest of these times, and the methods that have it.
+fn earliest<'a>(times: &[(f64, &'a str)]) -> Option<(f64, Vec<&'a str>)> {
+    let smallest = times.iter().map(|(time, _)| *time).min_by(f64::total_cmp)?;
+    Some((smallest, times.iter().filter(|(time, _)| *time == smallest).map(|(_, method)| *method).collect()))
+}
+
+/// "`a` is", or "`a`, `b` and `c` are".
+fn are(methods: &[&str]) -> String {
+    let names: Vec<String> = methods.iter().map(|method| format!("`{method}`")).collect();
+    match names.split_last() {
+        Some((last, [])) => format!("{last} is"),
+        Some((last, others)) => format!("{} and {last} are", others.join(", ")),
+        None => String::new(),
+    }
 }
 
 /// How the other methods compare with the baseline. An interval is the wider of the bootstrap's and Student's at either end.
@@ -120,4 +136,17 @@ fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<
     known.sort_by(|a, b| b.0.total_cmp(&a.0));
     let known: Vec<String> = known.iter().map(|(sparc, method)| format!("`{method}` {sparc:.1}")).collect();
     Ok(Some(format!("SPARC, from the smoothest hand to the jerkiest: {}.", known.join(", "))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn methods_that_are_equally_early_are_all_first() {
+        let (steps, first) = earliest(&[(500.0, "a"), (250.0, "b"), (250.0, "c")]).expect("three times");
+        assert_eq!((steps, are(&first)), (250.0, "`b` and `c` are".into()));
+        assert_eq!(are(&["a", "b", "c"]), "`a`, `b` and `c` are");
+        assert_eq!((are(&["a"]), earliest(&[])), ("`a` is".into(), None));
+    }
 }
