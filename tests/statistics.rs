@@ -289,7 +289,7 @@ fn a_summary_says_what_its_seeds_can_tell() {
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
         "| 1000 (12 s) | 2.5 |",
-        "- **pole**\n  - `dreamer` is first at 80 % success, by step 1000 (median).\n  - Significantly fewer steps to 80 % than `sac`: \
+        "- **pole**\n  - `dreamer` and `pets` are first at 80 % success, by step 1000 (median). `pets` is told the reward function.\n  - Significantly fewer steps to 80 % than `sac`: \
          `pets`. Not every seed gets there within the budget, so no ratio to `sac`: `dreamer`.\n  - Significantly more success in the \
          test than `sac`: `pets`. No significant difference in the test from `sac`: `dreamer`.\n",
         "one seed: the interval covers its test episodes, not what another seed would bring",

@@ -51,14 +51,17 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
     };
     let told = |method: &str| TOLD_THE_REWARD.contains(&method);
     let mut text = format!("{} first at {level:.0} % success, by step {steps:.0} (median).", are(&first));
-    if let Some(informed) = first.iter().find(|method| told(method)) {
-        text += &format!(" `{informed}` is told the reward function;");
-        medians.retain(|(_, method)| !told(method));
-        text += &match earliest(&medians) {
-            Some((steps, first)) => format!(" of the methods that are not, {} first, by step {steps:.0}.", are(&first)),
-            None => " no method that is not gets there in its median seed.".into(),
-        };
+    let informed: Vec<&str> = first.iter().copied().filter(|method| told(method)).collect();
+    if informed.is_empty() {
+        return Ok(text);
     }
+    text += &format!(" {} told the reward function", are(&informed));
+    medians.retain(|(_, method)| !told(method));
+    text += &match earliest(&medians) {
+        _ if informed.len() < first.len() => ".".into(),
+        Some((steps, first)) => format!("; of the methods that are not, {} first, by step {steps:.0}.", are(&first)),
+        None => "; no method that is not gets there in its median seed.".into(),
+    };
     Ok(text)
 }
 

@@ -86,6 +86,7 @@ pub(super) const SMALL: [(&str, &str); 6] = [
          [tdmpc2]
          batch = 2
          warm_up = 10
+         exploration_noise_beta = 1.0
          [tdmpc2.model]
          latent = 8
          group = 4
