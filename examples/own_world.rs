@@ -111,7 +111,7 @@ pub fn registry() -> Registry {
     Registry::standard()
         .env(EnvEntry::new("puck", || Ok(Puck::default())).with_known_reward().with_oracle())
         .preset("pets-learned", "base = \"pets\"\n[pets.ensemble]\nlearn_reward = true\n")
-        .quick_study(&["puck"], &["random", "oracle", "pets", "pets-learned", "dreamer", "sac"])
+        .quick_study(&["puck"], &["random", "oracle", "pets", "pets-learned", "dreamer", "sac"], None)
 }
 
 fn main() -> std::process::ExitCode {

@@ -13,6 +13,7 @@ use handful::prelude::*;
 use handful::rng;
 use handful::study::config::RunConfig;
 use handful::study::run::Event;
+use handful::study::runner::{Profile, StudyPlan};
 use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
@@ -349,6 +350,20 @@ fn presets_of_a_task_agree_on_their_evaluations() {
             assert_eq!((config.test_episodes, config.starts), (100, Starts::Test));
         }
     }
+}
+
+/// The quick study trains for at most 2,000 steps, a full one for as many as the presets say.
+#[test]
+fn a_plan_limits_the_steps_of_its_runs() {
+    let registry = Registry::standard();
+    let quick = StudyPlan::new(&registry, Profile::Quick, "quick".into());
+    let steps = |plan: &StudyPlan| -> Vec<usize> {
+        let runs = plan.runs(&registry).expect("known names");
+        runs.iter().filter(|(config, _)| config.learns()).map(|(config, _)| config.steps).collect()
+    };
+    assert_eq!(steps(&quick), [2_000; 8], "four methods, two seeds");
+    assert_eq!(steps(&StudyPlan { steps: Some(100_000), ..quick.clone() }), [3_000; 8], "the presets say fewer");
+    assert_eq!(steps(&StudyPlan { steps: None, ..quick }), [3_000; 8]);
 }
 
 /// Runs that last seconds: SAC, PETS, Dreamer, and planning in Dreamer's world model.

@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use super::config::RunConfig;
-use super::registry::Registry;
+use super::registry::{QuickStudy, Registry};
 use super::run::{Event, is_complete};
 use super::starts::{LIMIT, check_below};
 use crate::error::{Error, Result};
@@ -31,6 +31,8 @@ pub struct StudyPlan {
     pub methods: Vec<String>,
     /// The seeds of each.
     pub seeds: std::ops::Range<u64>,
+    /// Environment steps after which a run ends, if its preset does not say fewer.
+    pub steps: Option<usize>,
     /// Where everything is written.
     pub folder: PathBuf,
 }
@@ -41,13 +43,14 @@ impl StudyPlan {
         let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
         match profile {
             Profile::Quick => {
-                let [tasks, methods] = registry.quick_study.clone();
-                Self { tasks, methods, seeds: 0..2, folder }
+                let QuickStudy { tasks, methods, steps } = registry.quick_study.clone();
+                Self { tasks, methods, seeds: 0..2, steps, folder }
             }
             Profile::Full => Self {
                 tasks: named(&["reach", "push", "lift"]),
                 methods: named(&["random", "scripted", "oracle", "pets", "pets-learned", "dreamer", "tdmpc2", "sac"]),
                 seeds: 0..5,
+                steps: None,
                 folder,
             },
         }
@@ -88,7 +91,8 @@ impl StudyPlan {
         }
         let mut runs = Vec::new();
         for (task, method) in self.tasks.iter().flat_map(|task| self.methods.iter().map(move |method| (task, method))) {
-            let config = registry.config(task, method, self.seeds.start, None, None)?;
+            let mut config = registry.config(task, method, self.seeds.start, None, None)?;
+            config.steps = self.steps.map_or(config.steps, |most| most.min(config.steps));
             // Finds out now, not hours later, whether the method can be used for the task.
             registry.method(&config)?;
             let seeds = if config.learns() { self.seeds.clone() } else { self.seeds.start..self.seeds.start + 1 };

@@ -49,17 +49,28 @@ pub struct Registry {
     envs: Vec<ErasedEnv>,
     agents: Vec<AgentEntry>,
     presets: Vec<(String, String)>,
-    /// Tasks and methods of the quick study.
-    pub(super) quick_study: [Vec<String>; 2],
+    pub(super) quick_study: QuickStudy,
+}
+
+/// What the quick study compares.
+#[derive(Clone, Default)]
+pub(super) struct QuickStudy {
+    pub tasks: Vec<String>,
+    pub methods: Vec<String>,
+    /// Environment steps of a run, at most.
+    pub steps: Option<usize>,
 }
 
 impl Registry {
     /// The tasks, agents and presets of this crate.
     pub fn standard() -> Self {
         let presets = PRESETS.iter().map(|(name, text)| (name.to_string(), text.to_string())).collect();
-        let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: [Vec::new(), Vec::new()] };
-        agents::register(envs::register(registry))
-            .quick_study(&["reach"], &["random", "scripted", "oracle", "pets", "dreamer", "tdmpc2", "sac"])
+        let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: QuickStudy::default() };
+        agents::register(envs::register(registry)).quick_study(
+            &["reach"],
+            &["random", "scripted", "oracle", "pets", "dreamer", "tdmpc2", "sac"],
+            Some(2_000),
+        )
     }
 
     /// Adds an environment; one of the same name is replaced.
@@ -95,10 +106,12 @@ impl Registry {
         self.add_agent(AgentEntry::new(name, false, make))
     }
 
-    /// Says what the quick study compares: that is what a program does that is called without a command.
+    /// Says what the quick study compares: that is what a program does that is called without a command. Runs end after
+    /// `steps` environment steps, if that is less than their presets say.
     #[must_use]
-    pub fn quick_study(mut self, tasks: &[&str], methods: &[&str]) -> Self {
-        self.quick_study = [tasks, methods].map(|names| names.iter().map(ToString::to_string).collect());
+    pub fn quick_study(mut self, tasks: &[&str], methods: &[&str], steps: Option<usize>) -> Self {
+        let [tasks, methods] = [tasks, methods].map(|names| names.iter().map(ToString::to_string).collect());
+        self.quick_study = QuickStudy { tasks, methods, steps };
         self
     }
 
