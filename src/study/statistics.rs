@@ -119,8 +119,8 @@ pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rn
 /// brought (1 for a success). Tasks are not drawn; each counts the same, however many episodes it has.
 ///
 /// Davison & Hinkley, "Bootstrap methods and their application" (1997), section 3.8. With five seeds it covers the truth in
-/// about 90 % of cases instead of 95, with fewer seeds less often: [`t_interval`] is the wider companion. With one seed it
-/// says nothing about other seeds.
+/// 85 to 95 % of cases, the less the more the seeds differ, and with fewer seeds less often: [`t_interval`] is the wider
+/// companion. With one seed it says nothing about other seeds.
 ///
 /// # Panics
 /// If a task has no seeds or a seed no episodes.
