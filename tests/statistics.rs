@@ -13,7 +13,7 @@ use handful::prelude::*;
 use handful::rng;
 use handful::study::config::RunConfig;
 use handful::study::run::Event;
-use handful::study::runner::{Profile, StudyPlan};
+use handful::study::runner::{Budget, Profile, StudyPlan};
 use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
@@ -352,18 +352,22 @@ fn presets_of_a_task_agree_on_their_evaluations() {
     }
 }
 
-/// The quick study trains for at most 2,000 steps, a full one for as many as the presets say.
+/// The quick study has a budget of its own, a full one those of the presets.
 #[test]
-fn a_plan_limits_the_steps_of_its_runs() {
+fn a_plan_limits_the_budget_of_its_runs() {
     let registry = Registry::standard();
     let quick = StudyPlan::new(&registry, Profile::Quick, "quick".into());
-    let steps = |plan: &StudyPlan| -> Vec<usize> {
-        let runs = plan.runs(&registry).expect("known names");
-        runs.iter().filter(|(config, _)| config.learns()).map(|(config, _)| config.steps).collect()
+    let grids = |budget| -> Vec<(usize, usize)> {
+        let runs = StudyPlan { budget, ..quick.clone() }.runs(&registry).expect("known names");
+        let learning = runs.iter().filter(|(config, _)| config.learns());
+        learning.map(|(config, _)| (config.steps, config.evaluate_every)).collect()
     };
-    assert_eq!(steps(&quick), [2_000; 8], "four methods, two seeds");
-    assert_eq!(steps(&StudyPlan { steps: Some(100_000), ..quick.clone() }), [3_000; 8], "the presets say fewer");
-    assert_eq!(steps(&StudyPlan { steps: None, ..quick }), [3_000; 8]);
+    assert_eq!(grids(quick.budget), [(2_000, 500); 8], "four methods, two seeds");
+    let larger = Budget { steps: 100_000, evaluate_every: 1_000 };
+    assert_eq!(grids(Some(larger)), [(3_000, 1_000); 8], "the presets say fewer");
+    assert_eq!(grids(None), [(3_000, 250); 8]);
+    let never = StudyPlan { budget: Some(Budget { evaluate_every: 0, ..larger }), ..quick.clone() };
+    assert!(never.runs(&registry).is_err_and(|problem| problem.to_string().contains("evaluate_every")));
 }
 
 /// Runs that last seconds: SAC, PETS, Dreamer, and planning in Dreamer's world model.

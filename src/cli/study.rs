@@ -31,9 +31,6 @@ pub(super) struct Args {
     /// How many seeds, or a range like 0..5
     #[arg(long, value_parser = seed_range, allow_negative_numbers = true)]
     seeds: Option<Range<u64>>,
-    /// Environment steps of each run, at most; without --tasks, the quick profile has 2000
-    #[arg(long)]
-    steps: Option<NonZeroUsize>,
     /// Where the runs are measured: test, or development for runs that help to choose settings
     #[arg(long)]
     starts: Option<Starts>,
@@ -55,7 +52,6 @@ impl Default for Args {
             tasks: None,
             methods: None,
             seeds: None,
-            steps: None,
             starts: None,
             jobs: None,
             out: None,
@@ -79,8 +75,8 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     };
     let folder = args.out.unwrap_or_else(|| Path::new("runs").join(name));
     let mut plan = StudyPlan::new(registry, profile, folder);
-    // The profile's limit is one for its own tasks.
-    plan.steps = args.steps.map(usize::from).or(plan.steps.filter(|_| args.tasks.is_none()));
+    // The profile's budget is one for its own tasks.
+    plan.budget = plan.budget.filter(|_| args.tasks.is_none());
     plan.tasks = args.tasks.unwrap_or(plan.tasks);
     plan.methods = args.methods.unwrap_or(plan.methods);
     plan.seeds = args.seeds.unwrap_or(plan.seeds);

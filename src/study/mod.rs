@@ -22,7 +22,7 @@
 //!     tasks: vec!["cartpole".into()],
 //!     methods: vec!["random".into(), "debug".into()],
 //!     seeds: 0..1,
-//!     steps: None,
+//!     budget: None,
 //!     folder: folder.path().into(),
 //! };
 //! let registry = Registry::standard();

@@ -22,6 +22,15 @@ pub enum Profile {
     Full,
 }
 
+/// How long the methods that learn train, if that is less than their presets say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Environment steps of a run, at most.
+    pub steps: usize,
+    /// Environment steps from one evaluation to the next.
+    pub evaluate_every: usize,
+}
+
 /// What is compared.
 #[derive(Clone, Debug)]
 pub struct StudyPlan {
@@ -31,8 +40,8 @@ pub struct StudyPlan {
     pub methods: Vec<String>,
     /// The seeds of each.
     pub seeds: std::ops::Range<u64>,
-    /// Environment steps after which a run ends, if its preset does not say fewer.
-    pub steps: Option<usize>,
+    /// A budget for all runs; without one, each has that of its preset.
+    pub budget: Option<Budget>,
     /// Where everything is written.
     pub folder: PathBuf,
 }
@@ -43,14 +52,14 @@ impl StudyPlan {
         let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
         match profile {
             Profile::Quick => {
-                let QuickStudy { tasks, methods, steps } = registry.quick_study.clone();
-                Self { tasks, methods, seeds: 0..2, steps, folder }
+                let QuickStudy { tasks, methods, budget } = registry.quick_study.clone();
+                Self { tasks, methods, seeds: 0..2, budget, folder }
             }
             Profile::Full => Self {
                 tasks: named(&["reach", "push", "lift"]),
                 methods: named(&["random", "scripted", "oracle", "pets", "pets-learned", "dreamer", "tdmpc2", "sac"]),
                 seeds: 0..5,
-                steps: None,
+                budget: None,
                 folder,
             },
         }
@@ -92,7 +101,10 @@ impl StudyPlan {
         let mut runs = Vec::new();
         for (task, method) in self.tasks.iter().flat_map(|task| self.methods.iter().map(move |method| (task, method))) {
             let mut config = registry.config(task, method, self.seeds.start, None, None)?;
-            config.steps = self.steps.map_or(config.steps, |most| most.min(config.steps));
+            if let Some(Budget { steps, evaluate_every }) = self.budget {
+                (config.steps, config.evaluate_every) = (config.steps.min(steps), evaluate_every);
+                config.check()?;
+            }
             // Finds out now, not hours later, whether the method can be used for the task.
             registry.method(&config)?;
             let seeds = if config.learns() { self.seeds.clone() } else { self.seeds.start..self.seeds.start + 1 };

@@ -9,7 +9,7 @@
 //!     tasks: vec!["pendulum".into()],
 //!     methods: vec!["random".into(), "sac".into()],
 //!     seeds: 0..2,
-//!     steps: None,
+//!     budget: None,
 //!     folder: "runs/not-begun".into(),
 //! };
 //! let runs = status(&plan.runs(&Registry::standard())?);

@@ -43,7 +43,7 @@ fn a_study_of_the_puck_ends_in_a_report() {
         tasks: vec!["puck".into()],
         methods: ["random", "pets", "pets-learned", "dreamer", "sac"].map(String::from).into(),
         seeds: 0..1,
-        steps: None,
+        budget: None,
         folder: folder.path().into(),
     };
     let runs = plan.runs(&registry).expect("known names");

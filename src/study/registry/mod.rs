@@ -32,6 +32,7 @@ pub use envs::{EnvEntry, NoOptions, Settings};
 use super::config::{RunConfig, bad_config, upgrade_keys};
 use super::folder::{load_weights, read_config};
 use super::run::Run;
+use super::runner::Budget;
 use super::starts::{LIMIT, check_below};
 use crate::agent::{Checkpoint, Learner, Method, PRESETS, Policy, preset_table, specialise};
 use crate::env::Env;
@@ -57,8 +58,7 @@ pub struct Registry {
 pub(super) struct QuickStudy {
     pub tasks: Vec<String>,
     pub methods: Vec<String>,
-    /// Environment steps of a run, at most.
-    pub steps: Option<usize>,
+    pub budget: Option<Budget>,
 }
 
 impl Registry {
@@ -68,8 +68,9 @@ impl Registry {
         let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: QuickStudy::default() };
         agents::register(envs::register(registry)).quick_study(
             &["reach"],
-            &["random", "scripted", "oracle", "pets", "dreamer", "tdmpc2", "sac"],
-            Some(2_000),
+            // The longest runs first, so that no core waits for the last one.
+            &["dreamer", "pets", "tdmpc2", "oracle", "sac", "scripted", "random"],
+            Some(Budget { steps: 2_000, evaluate_every: 500 }),
         )
     }
 
@@ -106,12 +107,11 @@ impl Registry {
         self.add_agent(AgentEntry::new(name, false, make))
     }
 
-    /// Says what the quick study compares: that is what a program does that is called without a command. Runs end after
-    /// `steps` environment steps, if that is less than their presets say.
+    /// Says what the quick study compares, and with which budget: that is what a program does that is called without a command.
     #[must_use]
-    pub fn quick_study(mut self, tasks: &[&str], methods: &[&str], steps: Option<usize>) -> Self {
+    pub fn quick_study(mut self, tasks: &[&str], methods: &[&str], budget: Option<Budget>) -> Self {
         let [tasks, methods] = [tasks, methods].map(|names| names.iter().map(ToString::to_string).collect());
-        self.quick_study = QuickStudy { tasks, methods, steps };
+        self.quick_study = QuickStudy { tasks, methods, budget };
         self
     }
 
