@@ -1,4 +1,4 @@
-//! PETS at the sizes common in the literature (5 members of 28-3x200-24 with SiLU; 350 candidates, 15 time steps, 20
+//! PETS at the sizes common in the literature (5 members of 28-3x200-48 with SiLU; 350 candidates, 15 time steps, 20
 //! particles, 5 CEM iterations) and at those of the presets. Matrix products of the same sizes give the upper bound.
 
 use std::hint::black_box;

@@ -68,7 +68,7 @@
 //!
 //! # A map of the crate
 //!
-//! A module uses only its own layer and the layers below it; a test holds that.
+//! A module uses only its own layer and the layers below it; `tests/layering.rs` enforces that.
 //!
 //! | layer | module | what is in it |
 //! | --- | --- | --- |
@@ -85,13 +85,13 @@
 //! | 0 | [`checkpoint`], [`rng`], [`files`], [`settings`], [`error`] | weights in files, random numbers, files that are written whole, ranges of settings, errors |
 //! | 0 | `chart` | charts for chapters, examples and reports (feature `figures`) |
 //!
-//! What holds everywhere:
+//! Invariants:
 //! - Agents, evaluation, runs, replays and the study know an environment by its traits alone.
 //! - A planner never sees an environment: it maximises a closure.
-//! - No global state: every random number comes from a generator that was passed in, and one seed
+//! - No global generator: random numbers come from streams that follow from a seed and a purpose ([`rng::stream`]). One seed
 //!   fixes a run bit for bit, with any number of threads, with AVX2 and with AVX-512.
 //! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
-//! - Libraries return [`error::Error`]s; a panic is a bug.
+//! - What can fail returns an [`error::Error`]; a function panics only where its documentation says so.
 #![warn(missing_debug_implementations, missing_docs)]
 
 pub mod agent;

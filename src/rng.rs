@@ -1,4 +1,4 @@
-//! Random numbers. Every function that needs them takes a generator as an argument; there is no global one.
+//! Random numbers. Every function that needs them takes a generator as an argument; there is no global generator.
 //!
 //! A run has one seed. Each purpose within it has a stream of its own, so that drawing more numbers for one purpose does not
 //! change any other:
@@ -38,7 +38,7 @@ pub const SHAKE: &str = "HANDFUL_SHAKE";
 /// The value of [`SHAKE`], read once.
 ///
 /// # Panics
-/// If it is not a whole number below 2^16; [`read_shake`] answers with an error.
+/// If it is not a whole number below 2^16; [`read_shake`] returns an error instead.
 pub fn shake() -> u64 {
     static VALUE: OnceLock<u64> = OnceLock::new();
     *VALUE.get_or_init(|| read_shake().unwrap_or_else(|problem| panic!("{problem}")))

@@ -246,6 +246,11 @@ fn train_evaluate_and_watch() {
     let output = handful(here, &changed("slower.toml"));
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert!(summary["return_mean"].as_f64().is_some_and(|with_repeats| with_repeats != returns[2]), "{summary}");
+    // What the run has learned acts, also if the file says that it is not to learn.
+    std::fs::write(here.join("steps.toml"), "steps = 0\n").expect("a writable folder");
+    let output = handful(here, &changed("steps.toml"));
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(summary["return_mean"].as_f64(), Some(returns[2]), "{summary}");
     refused(here, &changed("wider.toml"), &["weights.safetensors", "has the sizes", "are expected"]);
     refused(here, &changed("wrong.toml"), &["wrong.toml", "action_repeats"]);
 
@@ -369,8 +374,11 @@ fn signals_leave_a_run_that_resumes() {
     for signal in ["-INT", "-TERM", "-HUP"] {
         let child = start();
         std::thread::sleep(Duration::from_secs(2));
-        let kill = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
-        assert!(kill.success());
+        // Twice at once, as GNU `timeout` does, which signals the process and its group.
+        for _ in 0..2 {
+            let kill = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
+            assert!(kill.success());
+        }
         let output = child.wait_with_output().expect("the program ends");
         let said = text(&output.stderr);
         assert_eq!(output.status.code(), Some(130), "{signal}: {said}");

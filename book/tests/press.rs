@@ -161,7 +161,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let reaching = ["pets", "sac", "tdmpc2", "dreamer", "pets-learned"].map(|method| lift(method, "seeds_reaching_80"));
     assert_eq!(reaching, [5.0, 5.0, 4.0, 1.0, 0.0]);
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
-    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| push("pets", column));
+    let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_t_low"].map(|column| push("pets", column));
     let sparc = ["pets", "sac"].map(|method| push(method, "smoothness_sparc"));
     let [more, from, to] = ["success_minus_sac", "success_minus_sac_t_low", "success_minus_sac_t_high"]
         .map(|column| 100.0 * push("pets", column));
@@ -173,7 +173,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         (
             "README.md",
             format!(
-                "With SAC, {} of five seeds are at 80 % within 60,000 steps; it takes at least {ratio:.1} times as many (95 % interval from {low:.1})",
+                "With SAC, {} of five seeds are at 80 % within 60,000 steps; it takes at least {ratio:.1} times as many (t interval from {low:.1})",
                 ["none", "one", "two", "three", "four", "five"][push("sac", "seeds_reaching_80") as usize]
             ),
         ),

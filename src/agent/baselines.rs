@@ -36,7 +36,7 @@ pub struct Scripted {
 }
 
 impl Scripted {
-    /// The policy that is a function from observations to actions, each number in [-1, 1].
+    /// The policy that is a function from observations to actions, each component in [-1, 1].
     pub fn new(policy: impl Fn(&[f32]) -> Vec<f32> + Send + 'static) -> Self {
         Self { policy: Box::new(policy) }
     }

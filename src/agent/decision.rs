@@ -1,4 +1,4 @@
-//! Decisions that last several time steps: an action that is held, and the experience that it brings.
+//! Decisions that last several time steps: an action that is held, and the experience of it.
 
 use crate::checkpoint::MAX_COUNT;
 use crate::replay::{Episode, Transition};

@@ -113,7 +113,7 @@ pub trait Agent: Send {
     /// A new episode begins: clears what the agent remembers of the one before (a recurrent state, a plan).
     fn begin_episode(&mut self) {}
 
-    /// Chooses an action, each number in [-1, 1].
+    /// Chooses an action, each component in [-1, 1].
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32>;
 
     /// Takes in one transition of experience.
@@ -216,8 +216,8 @@ pub trait Diagnostics {
     }
 }
 
-/// A discount factor for episodes of this many decisions (Hansen et al. 2024, TD-MPC2): (f - 1) / f for a fifth f of them,
-/// between 0.95 and 0.995.
+/// TD-MPC2's rule for the discount factor of episodes of this many decisions (Hansen et al. 2024): (f - 1) / f with f = decisions /
+/// 5, clipped to [0.95, 0.995].
 pub fn discount_for(decisions: f32) -> f32 {
     let fifth = decisions / 5.0;
     ((fifth - 1.0) / fifth).clamp(0.95, 0.995)

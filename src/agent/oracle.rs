@@ -1,7 +1,6 @@
 //! The oracle: a planner on the true simulator.
 //!
-//! It is no agent that anyone could have: it tries action sequences out in a copy of the very environment in which it
-//! acts. Between an agent that plans in a learned model with the same planner and objective, and the oracle, lies the
+//! It is not available to a real agent: it simulates action sequences in a copy of the environment in which it acts. Between an agent that plans in a learned model with the same planner and objective, and the oracle, lies the
 //! model's error alone. It is no upper bound on what agents can achieve: another planner or a longer horizon may do better.
 
 use rayon::prelude::*;
@@ -69,7 +68,7 @@ impl<E: Env + Snapshot> Oracle<E> {
     /// An oracle for the environments that `make` makes.
     ///
     /// # Errors
-    /// If a setting cannot be used, or what `make` answers.
+    /// If a setting cannot be used, or any error of `make`.
     pub fn new(make: impl Fn() -> Result<E>, config: OracleConfig, seed: u64) -> Result<Self> {
         config.check_at("oracle")?;
         let simulators = (0..rayon::current_num_threads()).map(|_| make()).collect::<Result<Vec<_>>>()?;

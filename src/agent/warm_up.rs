@@ -23,7 +23,7 @@ impl RandomActions {
         self.queue.clear();
     }
 
-    /// The next action, each number in [-1, 1].
+    /// The next action, each component in [-1, 1].
     pub(super) fn next(&mut self, rng: &mut Rng) -> Vec<f32> {
         self.deviates(rng).into_iter().map(|a| a.clamp(-1.0, 1.0)).collect()
     }

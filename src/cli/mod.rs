@@ -15,6 +15,7 @@ use std::process::ExitCode;
 use std::str::FromStr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use clap::{Parser, Subcommand};
 use console::style;
@@ -102,14 +103,20 @@ fn end_on_ctrl_c() -> Result<()> {
 }
 
 /// For commands that have something to save. The first Ctrl-C asks runs to finish their episode (in a
-/// test, the batch of episodes that run side by side) and to save, by setting what is returned; the second ends the program.
+/// test, the batch of episodes that run side by side) and to save, by setting what is returned; a second one, later than within a
+/// second, ends the program.
 /// SIGTERM and SIGHUP do the same.
 fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let asked = Arc::clone(&stop);
+    let mut first: Option<Instant> = None;
     handle_ctrl_c(move || {
-        if asked.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
+        asked.store(true, Ordering::Relaxed);
+        match first {
+            // GNU `timeout`, for one, signals a process and then its group.
+            Some(first) if first.elapsed() < Duration::from_secs(1) => return,
+            Some(_) => std::process::exit(130),
+            None => first = Some(Instant::now()),
         }
         note("\nfinishing the episodes that have begun and saving; press Ctrl-C again to quit at once");
     })?;

@@ -2,8 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "study")]
+use super::output::{answer, note};
+#[cfg(feature = "study")]
 use super::refuse_folder_of;
 use crate::error::{Error, Result};
+#[cfg(feature = "study")]
+use crate::study::report;
 
 #[derive(clap::Args)]
 pub(super) struct Args {
@@ -28,14 +33,17 @@ pub(super) fn run(args: &Args) -> Result<()> {
 #[cfg(feature = "study")]
 fn join(studies: &[PathBuf], to: &Path) -> Result<()> {
     refuse_folder_of("run", "config.toml", to)?;
+    studies.iter().try_for_each(|study| check_study(study))?;
     // Joined with themselves, they would be written over.
-    if let Some(study) = studies.iter().find(|study| study.canonicalize().ok() == to.canonicalize().ok()) {
+    if let Some(study) = studies.iter().find(|study| report::same_folder(study, to)) {
         return Err(Error::Config(format!(
             "{} is one of the studies that are joined: take another --out",
             study.display()
         )));
     }
-    crate::study::report::join(studies, to)?;
+    for problem in report::join(studies, to)? {
+        note(format_args!("no replay: {problem}"));
+    }
     write(to, to)
 }
 
@@ -46,11 +54,35 @@ fn join(_studies: &[PathBuf], to: &Path) -> Result<()> {
 
 #[cfg(feature = "study")]
 pub(super) fn write(from: &Path, to: &Path) -> Result<()> {
-    let table = crate::study::report::write(from, to)?;
-    super::output::answer(format_args!("{table}\nreport: {}", to.join("report.md").display()))
+    check_study(from)?;
+    let table = report::write_noting(from, to, &mut |text| note(text))?;
+    answer(format_args!("{table}\nreport: {}", to.join("report.md").display()))
 }
 
 #[cfg(not(feature = "study"))]
 pub(super) fn write(_from: &Path, _to: &Path) -> Result<()> {
     Err(Error::Config("reports need the feature `study`: cargo run --features study".into()))
+}
+
+/// # Errors
+/// If there are no tables of a study in the folder.
+#[cfg(feature = "study")]
+fn check_study(folder: &Path) -> Result<()> {
+    let name = folder.display();
+    let problem = if !folder.exists() {
+        format!(
+            "cannot read {name}: there is no such folder; give that of a study to --from, or make one: handful study --out {name}"
+        )
+    } else if folder.join("tests.csv").exists() {
+        return Ok(());
+    } else if folder.join("config.toml").exists() {
+        format!(
+            "{name}: this folder holds a run; give that of a study to --from, or test the run: handful evaluate --run {name}"
+        )
+    } else {
+        format!(
+            "{name}: there is no study (no tests.csv), or it is not complete: handful study --out {name} writes its tables at the end"
+        )
+    };
+    Err(Error::Config(problem))
 }

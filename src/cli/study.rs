@@ -13,6 +13,7 @@ use super::{refuse_folder_of, stop_on_ctrl_c};
 use crate::error::Result;
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
+use crate::study::run::check_run;
 use crate::study::runner::{self, Profile, StudyPlan};
 use crate::study::starts::Starts;
 use crate::study::status::{RunState, RunStatus, status, time_left};
@@ -83,7 +84,11 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
     refuse_folder_of("run", "config.toml", &plan.folder)?;
     let mut runs = plan.runs(registry)?;
-    runs.iter_mut().for_each(|(config, _)| config.starts = args.starts.unwrap_or(config.starts));
+    for (config, folder) in &mut runs {
+        config.starts = args.starts.unwrap_or(config.starts);
+        *config = registry.as_begun(config, folder);
+        check_run(folder, config)?;
+    }
     if args.status {
         return answer(report_status(&status(&runs), jobs));
     }
@@ -109,7 +114,9 @@ fn report_status(runs: &[RunStatus], jobs: usize) -> String {
         let trained = (100 * step).checked_div(steps).map_or(String::from("-"), |percent| format!("{percent} %"));
         let left = match time_left(runs, jobs) {
             _ if step == steps => String::from("-"),
-            Some(seconds) => HumanDuration(Duration::from_secs_f64(seconds)).to_string(),
+            Some(seconds) => {
+                Duration::try_from_secs_f64(seconds).map_or("unknown".into(), |left| HumanDuration(left).to_string())
+            }
             None => String::from("unknown"),
         };
         let [complete, running, stopped, waiting] =
@@ -138,6 +145,8 @@ fn seed_range(text: &str) -> Result<Range<u64>, String> {
 
 #[cfg(feature = "study")]
 fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+    // A run may have been begun there since.
+    refuse_folder_of("run", "config.toml", folder)?;
     let tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
     tables.write(folder)?;
     for problem in crate::study::replays::record(registry, runs, folder)? {

@@ -42,6 +42,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     config.starts = starts.unwrap_or(config.starts);
     let folder = out.unwrap_or_else(|| Path::new("runs").join(format!("{task}-{method}-seed{seed}")));
     refuse_folder_of("study", "tests.csv", &folder)?;
+    let config = registry.as_begun(&config, &folder);
     if is_complete(&folder, &config) {
         answer(format_args!("this run is complete: {}", folder.display()))?;
         return print_test(&folder);

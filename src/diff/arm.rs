@@ -32,7 +32,7 @@ use crate::env::osc::{Goal, OperationalSpaceController};
 use crate::env::physics::{STEPS_PER_CONTROL, TIMESTEP, dry_friction};
 use crate::env::tabletop::MAX_LEAD;
 
-/// Numbers in a state: joint angles (rad), joint velocities (rad/s), the position of the grip site (m). The last follows from the
+/// Dimension of a state: joint angles (rad), joint velocities (rad/s), the position of the grip site (m). The last follows from the
 /// first, and stands there so that costs need no kinematics.
 pub const STATE: usize = 2 * JOINTS + 3;
 

@@ -47,7 +47,7 @@ const STEP_SIZES: [f64; 8] = [1.0, 0.6, 0.35, 0.2, 0.1, 0.05, 0.02, 0.01];
 /// The result of [`Ilqr::solve`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Solution<const N: usize, const M: usize> {
-    /// The actions, each number in [-1, 1].
+    /// The actions, each component in [-1, 1].
     pub actions: Vec<SVector<f64, M>>,
     /// The trajectory of states, the start included.
     pub states: Vec<SVector<f64, N>>,

@@ -82,7 +82,7 @@ impl RecordedLift {
         Self { joints: vec![[q, qd]], actions: Vec::new() }
     }
 
-    /// Adds a control step: the action, each number in [-1, 1], and the joint angles (rad) and velocities (rad/s) after it.
+    /// Adds a control step: the action, each component in [-1, 1], and the joint angles (rad) and velocities (rad/s) after it.
     pub fn push(&mut self, action: Vector3<f64>, q: JointVector, qd: JointVector) {
         self.actions.push(action);
         self.joints.push([q, qd]);

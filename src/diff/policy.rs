@@ -104,7 +104,7 @@ impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M
         }
     }
 
-    /// The policy's action for an observation, each number in [-1, 1].
+    /// The policy's action for an observation, each component in [-1, 1].
     pub fn act(&self, observation: &SVector<f32, O>) -> SVector<f32, M> {
         let seen = tensor(&device(), observation.as_slice().to_vec(), (1, 1, O));
         SVector::from_column_slice(values(&self.policy.forward(seen, Grad::Input).tanh()))

@@ -71,7 +71,7 @@ impl Pusher<f64> {
     }
 }
 
-/// Numbers in a state: the hand's position (m), the block's position (m) and angle (rad), the block's velocity (m/s) and angular
+/// Dimension of a state: the hand's position (m), the block's position (m) and angle (rad), the block's velocity (m/s) and angular
 /// velocity (rad/s), in this order.
 pub const STATE: usize = 8;
 

@@ -76,7 +76,7 @@ impl<E: Env> Checked<E> {
     /// [`Env::step`]. Steps are counted from 1 in every episode.
     ///
     /// # Errors
-    /// What [`Env::step`] answers, after which the episode goes on; [`Error::Contract`] if a rule is broken, after which
+    /// Any error of [`Env::step`], after which the episode goes on; [`Error::Contract`] if a rule is broken, after which
     /// only a reset helps.
     pub fn step(&mut self, action: &[f32]) -> Result<Step> {
         let Some(elapsed) = self.elapsed else {

@@ -28,7 +28,7 @@ pub struct Spec {
     pub name: String,
     /// One feature for each number of an observation, in order.
     pub observation: Vec<Feature>,
-    /// Numbers in an action; each lies in [-1, 1].
+    /// Dimension of an action; each component lies in [-1, 1].
     pub action_size: usize,
     /// Control steps in an episode; reaching this limit is a truncation, not a termination.
     pub horizon: usize,
@@ -177,7 +177,7 @@ impl Spec {
         Ok(())
     }
 
-    /// Numbers in an observation.
+    /// Dimension of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation.len()
     }

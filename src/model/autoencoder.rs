@@ -16,7 +16,7 @@ use crate::rng::Rng;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AutoencoderConfig {
-    /// Numbers in a code, the latent state.
+    /// Dimension of a code, the latent state.
     pub code: usize,
     /// Width of each hidden layer of encoder, decoder and dynamics.
     pub hidden: Vec<usize>,

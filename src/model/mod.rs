@@ -60,6 +60,6 @@ pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit, LearnedReward};
 pub use features::{Cube, FeatureMap, LatentFeatures, Normaliser};
 pub use imagination::{Imagination, ImaginedReturns, Propagation, Reward, Value};
-pub use implicit::{ImplicitConfig, ImplicitLoss, ImplicitModel, PolicyPrior, Probe, Probed};
+pub use implicit::{EntropyBonus, ImplicitConfig, ImplicitLoss, ImplicitModel, PolicyPrior, Probe, Probed};
 pub use rssm::{Latent, Rssm, RssmConfig};
 pub use world_model::{WorldModel, WorldModelConfig, WorldModelLoss};

@@ -42,7 +42,7 @@ use crate::settings::{fits, ranges};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RssmConfig {
-    /// Numbers in the deterministic state h.
+    /// Dimension of the deterministic state h.
     #[doc(alias = "recurrent state")]
     pub deter: usize,
     /// Diagonal blocks in the weights of the sequence model; they must divide `deter`.
@@ -78,12 +78,12 @@ require fits(&[*hidden, 3 * deter + stoch * classes]) => "`hidden` times the num
 );
 
 impl RssmConfig {
-    /// Numbers in the stochastic state, `stoch x classes`.
+    /// Dimension of the stochastic state, `stoch x classes`.
     pub fn stoch_size(&self) -> usize {
         self.stoch * self.classes
     }
 
-    /// Numbers in the features that the heads read: deterministic and stochastic state side by side.
+    /// Dimension of the features that the heads read: deterministic and stochastic state side by side.
     pub fn features(&self) -> usize {
         self.deter + self.stoch_size()
     }
@@ -154,7 +154,7 @@ parameters_of_fields!(
 );
 
 impl Rssm {
-    /// A new model for `actions` numbers in an action and `token` numbers in an encoded observation.
+    /// A new model for actions of dimension `actions` and encoded observations of dimension `token`.
     pub fn new(cpu: &Cpu, config: &RssmConfig, actions: usize, token: usize, rng: &mut Rng) -> Self {
         let RssmConfig { deter, blocks, hidden, .. } = *config;
         let stoch = config.stoch_size();
@@ -187,7 +187,7 @@ impl Rssm {
         Latent { deter: zeros(self.config.deter), stoch: zeros(self.config.stoch_size()) }
     }
 
-    /// One step with an observation: the latent state after `action` (`[1, rows, actions]`, each number in [-1, 1]) has led
+    /// One step with an observation: the latent state after `action` (`[1, rows, actions]`, each component in [-1, 1]) has led
     /// to the encoded observation `token` (`[1, rows, token]`), drawn from the posterior. Also the posterior's logits.
     pub fn observe<T: Tape<f32, Cpu>>(
         &self,

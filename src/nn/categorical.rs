@@ -42,7 +42,7 @@ pub struct Categorical {
 }
 
 impl Categorical {
-    /// Numbers in a row of logits or of samples, `count x classes`.
+    /// Width of a row of logits or of samples, `count x classes`.
     pub fn width(&self) -> usize {
         self.count * self.classes
     }

@@ -60,10 +60,10 @@ pub struct Cem {
 }
 
 impl Cem {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Panics
-    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) returns an error instead.
     pub fn new(config: CemConfig, action_size: usize) -> Self {
         must_hold(&config, "cem");
         let mean = vec![0.0; config.horizon * action_size];

@@ -38,7 +38,7 @@ pub enum PlannerConfig {
 }
 
 impl PlannerConfig {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Errors
     /// If a setting lies outside its range, an action has no numbers, or the candidates do not fit into memory.

@@ -114,7 +114,7 @@ pub struct RecedingHorizon {
 }
 
 impl RecedingHorizon {
-    /// A controller for actions of `action_size` numbers.
+    /// A controller for `action_size`-dimensional actions.
     ///
     /// # Panics
     /// If `action_repeat` or `replan_every` is 0.

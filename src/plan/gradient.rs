@@ -60,10 +60,10 @@ pub struct Gradient {
 }
 
 impl Gradient {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Panics
-    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) returns an error instead.
     pub fn new(config: GradientConfig, action_size: usize) -> Self {
         must_hold(&config, "gradient");
         let noise = ColoredNoise::new(config.noise_beta, config.horizon);

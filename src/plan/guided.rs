@@ -13,7 +13,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, best, shifted, weights};
 use crate::rng::{self, Rng};
 use crate::settings::{must_hold, ranges};
 
@@ -80,10 +80,10 @@ require min_deviation <= max_deviation => "`min_deviation` must not exceed `max_
 /// use handful::plan::{ActionSequences, GuidedConfig, GuidedMppi, Objective, Planner};
 /// use handful::rng;
 ///
-/// /// The closer to 0.9 all actions are, the higher the return; and somebody already suspects so.
-/// struct Suspected;
+/// /// The closer to 0.9 all actions are, the higher the return; the objective proposes a sequence close to that.
+/// struct WithProposals;
 ///
-/// impl Objective for Suspected {
+/// impl Objective for WithProposals {
 ///     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
 ///         sequences.rows().map(|row| -row.iter().map(|a| (a - 0.9).abs()).sum::<f32>()).collect()
 ///     }
@@ -93,7 +93,7 @@ require min_deviation <= max_deviation => "`min_deviation` must not exceed `max_
 /// }
 ///
 /// let mut planner = GuidedMppi::new(GuidedConfig { temperature: 0.1, ..GuidedConfig::default() }, 4);
-/// let plan = planner.plan(&mut Suspected, &mut |_| {}, &mut rng::stream(0, "example"));
+/// let plan = planner.plan(&mut WithProposals, &mut |_| {}, &mut rng::stream(0, "example"));
 /// assert!(plan.best_return > -1.2);
 /// ```
 #[doc(alias = "TD-MPC2")]
@@ -109,10 +109,10 @@ pub struct GuidedMppi {
 }
 
 impl GuidedMppi {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Panics
-    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) returns an error instead.
     pub fn new(config: GuidedConfig, action_size: usize) -> Self {
         must_hold(&config, "guided");
         let numbers = config.horizon * action_size;
@@ -168,7 +168,7 @@ impl Planner for GuidedMppi {
             // Fit to the elites.
             let order = best(&returns, config.elites);
             let elites: Vec<&[f32]> = order.iter().map(|i| candidates.row(*i)).collect();
-            let weights = weights(order.iter().map(|i| returns[*i]), config.temperature);
+            let weights = weights(&order.iter().map(|i| returns[*i]).collect::<Vec<f32>>(), config.temperature);
             self.fit(&elites, &weights);
             observer(&Iteration { index, candidates: &candidates, returns: &returns, mean: &self.mean });
             if index + 1 == config.iterations && config.execute_mean {
@@ -184,17 +184,6 @@ impl Planner for GuidedMppi {
     fn shift(&mut self, steps: usize) {
         shifted(&mut self.mean, steps, self.action_size, &vec![0.0; self.action_size]);
     }
-}
-
-/// w_i = exp(R_i / temperature), divided by their sum. A return that is not finite weighs nothing; if none is, all weigh the
-/// same.
-fn weights(returns: impl Iterator<Item = f32> + Clone, temperature: f64) -> Vec<f64> {
-    let top = returns.clone().filter(|r| r.is_finite()).fold(f32::NEG_INFINITY, f32::max);
-    let weigh = |r: f32| if r.is_finite() { (f64::from(r - top) / temperature).exp() } else { 0.0 };
-    let weights: Vec<f64> = returns.map(weigh).collect();
-    let sum: f64 = weights.iter().sum();
-    let equal = 1.0 / weights.len() as f64;
-    weights.iter().map(|w| if sum > 0.0 { w / sum } else { equal }).collect()
 }
 
 /// A sample from the standard Gumbel distribution.
@@ -224,7 +213,7 @@ mod tests {
         let rows = [[0.2, -0.4], [1.0, 0.5], [-0.3, 0.1], [0.9, -1.0], [0.0, 0.6]];
         let mut planner = GuidedMppi::new(GuidedConfig { horizon: 2, ..GuidedConfig::default() }, 1);
         let mut check = |order: &[usize], expected: &[f64], mean: [f64; 2], deviation: [f64; 2]| {
-            let found = weights(order.iter().map(|i| returns[*i]), 2.0);
+            let found = weights(&order.iter().map(|i| returns[*i]).collect::<Vec<f32>>(), 2.0);
             near(&found, expected);
             planner.fit(&order.iter().map(|i| &rows[*i][..]).collect::<Vec<_>>(), &found);
             near(&planner.mean, &mean);
@@ -236,12 +225,5 @@ mod tests {
         assert_eq!(three, [1, 2, 4]);
         check(&three, &[0.419_229, 0.326_496, 0.254_275], [0.321_280, 0.394_829], [0.587_701, 0.209_096]);
         assert_eq!(drawn(&[0.5, 0.3, 0.2], &[0.1, 1.2, 0.4]), 1);
-    }
-
-    #[test]
-    fn returns_that_are_no_numbers_weigh_nothing() {
-        let found = weights([f32::NAN, 1.0, f32::INFINITY, 1.0].into_iter(), 1.0);
-        near(&found, &[0.0, 0.5, 0.0, 0.5]);
-        near(&weights([f32::NAN; 2].into_iter(), 1.0), &[0.5, 0.5]);
     }
 }

@@ -38,10 +38,10 @@ pub struct Hybrid {
 }
 
 impl Hybrid {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Panics
-    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) returns an error instead.
     pub fn new(config: HybridConfig, action_size: usize) -> Self {
         must_hold(&config, "hybrid");
         let HybridConfig { icem, iterations, rate } = config;

@@ -9,7 +9,7 @@
 //! | --- | --- |
 //! | [`RandomShooting`] | the best of many uniform random sequences |
 //! | [`Cem`] | the cross-entropy method, as in PETS |
-//! | [`Icem`] | CEM with coloured noise and a memory |
+//! | [`Icem`] | CEM with coloured noise; elites are kept between iterations and plans |
 //! | [`Mppi`] | model predictive path integral control: an average of all samples, weighted by exp(return) |
 //! | [`GuidedMppi`] | MPPI over the best candidates, among them a policy's proposals, as in TD-MPC2 |
 //! | [`Gradient`] | gradient ascent on the actions (gradient shooting) |
@@ -65,14 +65,14 @@ use crate::rng::Rng;
 pub struct ActionSequences {
     /// Time steps in each sequence.
     pub horizon: usize,
-    /// Numbers in an action.
+    /// Dimension of an action.
     pub actions: usize,
     /// All numbers, sequence after sequence, time step after time step.
     pub values: Vec<f32>,
 }
 
 impl ActionSequences {
-    /// An empty batch, for sequences of `horizon` actions of `action_size` numbers.
+    /// An empty batch, for sequences of `horizon` `action_size`-dimensional actions.
     pub fn new(horizon: usize, action_size: usize) -> Self {
         Self { horizon, actions: action_size, values: Vec::new() }
     }
@@ -95,7 +95,7 @@ impl ActionSequences {
         self.values.chunks_exact(self.width())
     }
 
-    /// Numbers in a sequence.
+    /// Numbers in a sequence: horizon times dimension of an action.
     fn width(&self) -> usize {
         self.horizon * self.actions
     }
@@ -107,7 +107,8 @@ pub trait Objective {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32>;
 
     /// Returns, `[count]`, and their gradients with respect to the actions, `[count, horizon, actions]`. The default takes
-    /// central differences, at the price of two more returns for each number; a differentiable objective overrides it.
+    /// central differences, at the price of two more returns for each number; a differentiable objective overrides it. It may
+    /// differentiate an approximation: planners compare sequences by `returns`.
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         const STEP: f32 = 1e-3;
         let width = sequences.width();
@@ -245,7 +246,7 @@ impl<P: Planner + ?Sized> Planner for Box<P> {
 /// let planners = [by_name.make(3), by_closure.make(3)];
 /// ```
 pub trait MakePlanner: Send + Sync {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     fn make(&self, action_size: usize) -> Box<dyn Planner>;
 }
 
@@ -270,12 +271,29 @@ fn best(returns: &[f32], count: usize) -> Vec<usize> {
     order
 }
 
+/// w_i = exp((R_i - max R) / temperature), divided by their sum: the weights of MPPI. A return that is not finite weighs nothing;
+/// if none is finite, all weigh the same.
+fn weights(returns: &[f32], temperature: f64) -> Vec<f64> {
+    let top = returns.iter().copied().filter(|r| r.is_finite()).fold(f32::NEG_INFINITY, f32::max);
+    let weigh = |r: &f32| if r.is_finite() { (f64::from(r - top) / temperature).exp() } else { 0.0 };
+    let weights: Vec<f64> = returns.iter().map(weigh).collect();
+    let sum: f64 = weights.iter().sum();
+    let equal = 1.0 / weights.len() as f64;
+    weights.iter().map(|w| if sum > 0.0 { w / sum } else { equal }).collect()
+}
+
 /// Drops the first `steps` actions of a sequence, and appends `last` as many times.
 fn shifted<T: Copy>(sequence: &mut Vec<T>, steps: usize, action_size: usize, last: &[T]) {
     for _ in 0..steps {
         sequence.drain(..action_size);
         sequence.extend_from_slice(last);
     }
+}
+
+/// About `count` of an iteration's candidates to show, evenly spaced in the order of their returns, best first.
+pub(crate) fn spread(iteration: &Iteration, count: usize) -> Vec<usize> {
+    let all = iteration.returns.len();
+    best(iteration.returns, all).into_iter().step_by((all / count).max(1)).collect()
 }
 
 /// The mean of a search distribution as actions within the bounds.
@@ -291,5 +309,32 @@ mod tests {
     fn the_best_come_first_and_no_number_comes_last() {
         assert_eq!(best(&[1.0, f32::NAN, 3.0, 2.0], 2), [2, 3]);
         assert_eq!(best(&[f32::NAN, f32::NEG_INFINITY, 0.0], 1), [2]);
+    }
+
+    #[test]
+    fn weights_are_those_of_the_reference() {
+        for (temperature, expected) in
+            [(1.0, [0.705_384_51, 0.259_496_46, 0.035_119_03]), (2.0, [0.546_549_39, 0.331_498_96, 0.121_951_65])]
+        {
+            for (found, expected) in weights(&[10.0, 9.0, 7.0], temperature).iter().zip(expected) {
+                assert!((found - expected).abs() < 1e-7, "{found}, expected {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn returns_that_are_not_finite_weigh_nothing() {
+        assert_eq!(weights(&[f32::NAN, 1.0, f32::INFINITY, 1.0], 1.0), [0.0, 0.5, 0.0, 0.5]);
+        assert_eq!(weights(&[f32::NAN; 2], 1.0), [0.5, 0.5]);
+        assert_eq!(weights(&[f32::NEG_INFINITY; 2], 1.0), [0.5, 0.5]);
+    }
+
+    #[test]
+    fn candidates_are_shown_from_the_best_to_the_worst() {
+        let candidates = ActionSequences { values: vec![0.0; 6], ..ActionSequences::new(1, 1) };
+        let returns = [1.0, f32::NAN, 3.0, 2.0, 5.0, 4.0];
+        let iteration = Iteration { index: 0, candidates: &candidates, returns: &returns, mean: &[0.0] };
+        assert_eq!(spread(&iteration, 3), [4, 2, 0]);
+        assert_eq!(spread(&iteration, 10), [4, 5, 2, 3, 0, 1]);
     }
 }

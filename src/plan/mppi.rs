@@ -9,7 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, shifted};
+use super::{ActionSequences, Iteration, Objective, Plan, PlanObserver, Planner, as_actions, shifted, weights};
 use crate::rng::{self, Rng};
 use crate::settings::{must_hold, ranges};
 
@@ -63,10 +63,10 @@ pub struct Mppi {
 }
 
 impl Mppi {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Panics
-    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) returns an error instead.
     pub fn new(config: MppiConfig, action_size: usize) -> Self {
         must_hold(&config, "mppi");
         Self { mean: vec![0.0; config.horizon * action_size], before: vec![0.0; action_size], action_size, config }
@@ -123,39 +123,10 @@ impl Planner for Mppi {
     }
 }
 
-/// The weights of MPPI, `[candidates]`: w_i = exp((R_i - max R) / temperature), divided by their sum. A return of NaN
-/// weighs nothing.
-fn weights(returns: &[f32], temperature: f64) -> Vec<f64> {
-    let top = returns.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    let weigh = |r: &f32| if r.is_nan() { 0.0 } else { (f64::from(r - top) / temperature).exp() };
-    let weights: Vec<f64> = returns.iter().map(weigh).collect();
-    let sum: f64 = weights.iter().sum();
-    weights.iter().map(|w| w / sum).collect()
-}
-
 /// The standard deviation of the finite returns; a little above zero if all are equal.
 fn standard_deviation(returns: &[f32]) -> f64 {
     let known: Vec<f64> = returns.iter().filter(|r| r.is_finite()).map(|r| f64::from(*r)).collect();
     let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
     let variance = known.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / known.len().max(1) as f64;
     variance.sqrt().max(1e-6)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn weights_are_those_of_the_reference() {
-        let returns = [10.0, 9.0, 7.0];
-        for (temperature, expected) in
-            [(1.0, [0.705_384_51, 0.259_496_46, 0.035_119_03]), (2.0, [0.546_549_39, 0.331_498_96, 0.121_951_65])]
-        {
-            for (found, expected) in weights(&returns, temperature).iter().zip(expected) {
-                assert!((found - expected).abs() < 1e-7, "{found}, expected {expected}");
-            }
-        }
-        let mean: f64 = weights(&returns, 1.0).iter().zip([0.2, -0.1, 0.9]).map(|(w, a)| w * a).sum();
-        assert!((mean - 0.146_734_38).abs() < 1e-7);
-    }
 }

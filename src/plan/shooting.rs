@@ -33,10 +33,10 @@ pub struct RandomShooting {
 }
 
 impl RandomShooting {
-    /// A planner for actions of `action_size` numbers.
+    /// A planner for `action_size`-dimensional actions.
     ///
     /// # Panics
-    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) answers with an error.
+    /// If a setting lies outside its range; [`PlannerConfig::try_build`](super::PlannerConfig::try_build) returns an error instead.
     pub fn new(config: ShootingConfig, action_size: usize) -> Self {
         must_hold(&config, "shooting");
         Self { config, action_size }

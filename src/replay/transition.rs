@@ -14,7 +14,7 @@ use crate::rng::Rng;
 pub struct Transition {
     /// The observation before the step.
     pub obs: Vec<f32>,
-    /// The action, as the agent chose it, each number in [-1, 1].
+    /// The action, as the agent chose it, each component in [-1, 1].
     pub action: Vec<f32>,
     /// The reward of the step.
     pub reward: f32,

@@ -189,7 +189,7 @@ pub(crate) fn settings_table(settings: &impl Serialize) -> Table {
 }
 
 /// Keys that had another name in earlier versions, with the table in which they stand.
-const RENAMED_KEYS: [(&str, &str, &str); 13] = [
+const RENAMED_KEYS: [(&str, &str, &str); 15] = [
     ("pets", "tail", "terminal_weight"),
     ("oracle", "tail", "terminal_weight"),
     ("pets", "caution", "disagreement_penalty"),
@@ -203,6 +203,8 @@ const RENAMED_KEYS: [(&str, &str, &str); 13] = [
     ("gradient", "colour", "noise_beta"),
     ("rssm", "memory", "deter"),
     ("rssm", "categoricals", "stoch"),
+    ("sac", "polyak", "target_rate"),
+    ("behaviour", "slow_rate", "target_rate"),
 ];
 
 /// Gives the keys and values of earlier versions the names that they have now.
@@ -212,7 +214,10 @@ pub(crate) fn upgrade_keys(table: &mut Table) {
 
 fn upgrade_table(name: &str, table: &mut Table) {
     for (_, old, new) in RENAMED_KEYS.iter().filter(|(within, ..)| *within == name) {
-        if let Some(value) = table.remove(*old) {
+        // Where both stand, the old one is an unknown field.
+        if !table.contains_key(*new)
+            && let Some(value) = table.remove(*old)
+        {
             table.insert((*new).into(), value);
         }
     }
@@ -235,7 +240,7 @@ fn upgrade_table(name: &str, table: &mut Table) {
     }
 }
 
-/// One line of what is wrong with a configuration; for an unknown field, with the closest known one.
+/// One line of what is wrong with a configuration, and where; for an unknown field, with the closest known one.
 pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
     let message = source.message();
     let unknown = message.strip_prefix("unknown field `").and_then(|rest| rest.rsplit_once("`, expected"));
@@ -243,9 +248,14 @@ pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
         Some((field, known)) => Error::unknown("field", field, known.split('`').skip(1).step_by(2)).to_string(),
         None => shortened(message.trim_end(), 300),
     };
-    // The path of the field is told only as the last line of the whole message.
+    // The path of the field is told only as the last line of the whole message, and the line of the file in its first.
     let whole = source.to_string();
-    let place = whole.trim_end().rsplit_once("\nin `").and_then(|(_, place)| place.strip_suffix('`'));
-    let problem = place.map_or(problem.clone(), |place| format!("`{}`: {problem}", shortened(place, 100)));
+    let field = whole.trim_end().rsplit_once("\nin `").and_then(|(_, field)| field.strip_suffix('`'));
+    let line = whole.lines().next().and_then(|line| line.strip_prefix("TOML parse error at "));
+    let problem = match (field, line) {
+        (Some(field), _) => format!("`{}`: {problem}", shortened(field, 100)),
+        (None, Some(line)) => format!("{line}: {problem}"),
+        (None, None) => problem,
+    };
     Error::ConfigFile { path: path.into(), problem, source: Box::new(source.clone()) }
 }

@@ -124,7 +124,7 @@ impl<E: Env> Evaluator<E> {
     /// An evaluator with environments made by `make`.
     ///
     /// # Errors
-    /// What `make` answers, or what is wrong with the environment's spec.
+    /// Any error of `make`, or what is wrong with the environment's spec.
     pub fn new(make: impl Fn() -> Result<E> + Sync) -> Result<Self> {
         make()?.spec().check()?;
         Ok(Self { envs: VectorEnv::new(ENVS, || make().expect("what was made once can be made again")) })
@@ -146,7 +146,7 @@ impl<E: Env> Evaluator<E> {
         Ok(evaluation)
     }
 
-    /// Adds to an evaluation of `episodes` episodes the next batch of those that run side by side, and answers whether
+    /// Adds to an evaluation of `episodes` episodes the next batch of those that run side by side, and returns whether
     /// that was the last: for a caller that wants to show, or to save, the results so far.
     ///
     /// # Errors

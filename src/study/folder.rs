@@ -53,20 +53,23 @@ impl RunFolder {
     /// Opens the folder for a run, new or begun.
     ///
     /// # Errors
-    /// If it is open elsewhere, holds another run, or cannot be written.
+    /// If it is open elsewhere, holds another run or weights without a checkpoint to go on from, or cannot be written.
     pub fn claim(path: &Path, config: &RunConfig) -> Result<Self> {
         // Before the sources can change under a run of hours.
         LazyLock::force(&SOURCE);
         let folder = Self { path: path.into(), _lock: lock(path)? };
-        let file = path.join(CONFIG);
-        if file.exists() {
-            if let Some(difference) = difference(&RunConfig::read(&file)?.to_table(), &config.to_table()) {
-                return Err(Error::Config(format!(
-                    "{}: this folder holds another run ({difference}); choose another --out, or remove it",
-                    file.display()
-                )));
+        check_run(path, config)?;
+        let [file, checkpoint, weights] = [CONFIG, CHECKPOINT, WEIGHTS].map(|file| path.join(file));
+        if !checkpoint.exists() && weights.exists() {
+            return Err(Error::Config(format!(
+                "{}: trained weights without a checkpoint to go on from; choose another --out, or remove the folder to start anew",
+                weights.display()
+            )));
+        }
+        if !file.exists() {
+            if checkpoint.exists() {
+                read_own(&checkpoint, config)?;
             }
-        } else {
             files::write(&file, config.to_toml().as_bytes())?;
         }
         for place in [path.to_path_buf(), path.join("checkpoint")] {
@@ -75,7 +78,7 @@ impl RunFolder {
         Ok(folder)
     }
 
-    /// Gives the method of this run its saved state, and answers how far the run had come. None if nothing was saved.
+    /// Gives the method of this run its saved state, and returns how far the run had come. None if nothing was saved.
     ///
     /// # Errors
     /// If the checkpoint is damaged, or another run's.
@@ -86,7 +89,7 @@ impl RunFolder {
         }
         let state = read_own(&path, config)?;
         let foreign = |problem: Error| {
-            let advice = format!("not a checkpoint of this run ({problem}); remove it to start anew");
+            let advice = format!("not a checkpoint of this run ({problem}); remove the folder to start anew");
             Error::checkpoint(&path, advice, Some(problem.into()))
         };
         let progress = state.note("progress").ok_or_else(|| foreign(Error::Config("it tells no progress".into())))?;
@@ -131,7 +134,10 @@ impl RunFolder {
         let files = TABLES.into_iter().chain(config.learns().then_some(WEIGHTS));
         let checksums = files.map(|file| Ok((file.into(), checksum(&self.path.join(file))?)));
         let checksums = checksums.collect::<Result<_>>()?;
-        let completed = Completed { version: SOURCE.clone(), summary: test.summary(), checksums };
+        // What is lost of a complete run may be written anew by a later version, which has not made it.
+        let made_by = Completed::read(&self.path).ok().map(|run| run.version).filter(|version| !version.is_empty());
+        let version = made_by.unwrap_or_else(|| SOURCE.clone());
+        let completed = Completed { version, summary: test.summary(), checksums };
         let completed = toml::to_string(&completed).expect("a summary is TOML");
         files::write(&self.path.join(SUMMARY), completed.as_bytes())
     }
@@ -169,6 +175,20 @@ fn checksum(path: &Path) -> Result<u32> {
     Ok(crc32fast::hash(&std::fs::read(path).map_err(Error::io("read", path))?))
 }
 
+/// # Errors
+/// If the folder holds another run.
+pub(crate) fn check_run(folder: &Path, config: &RunConfig) -> Result<()> {
+    let file = folder.join(CONFIG);
+    let there = if file.exists() { RunConfig::read(&file)? } else { return Ok(()) };
+    match difference(&there.to_table(), &config.to_table()) {
+        None => Ok(()),
+        Some(difference) => Err(Error::Config(format!(
+            "{}: this folder holds another run ({difference}); choose another --out, or remove it",
+            file.display()
+        ))),
+    }
+}
+
 /// Whether a folder holds this run, complete with its tables and weights. What is lost or damaged can be written anew from the
 /// checkpoint, by opening the run; without a checkpoint the run has ended as it is.
 pub fn is_complete(folder: &Path, config: &RunConfig) -> bool {
@@ -198,8 +218,11 @@ pub(super) fn check_tables(folder: &Path) -> Result<()> {
     match Completed::read(folder).ok().and_then(|run| run.changed(folder, ".csv")) {
         None => Ok(()),
         Some(path) => {
-            let advice = "it was lost or changed after the run had ended; the command that made the run writes it anew";
-            Err(Error::data(&path)(advice))
+            let advice = match folder.join(CHECKPOINT).is_file() {
+                true => "the command that made the run writes it anew",
+                false => "restore it, or remove the run's folder and carry the run out again",
+            };
+            Err(Error::data(&path)(format!("it was lost or changed after the run had ended; {advice}")))
         }
     }
 }
@@ -210,6 +233,10 @@ pub(super) fn check_tables(folder: &Path) -> Result<()> {
 /// If there is none, or it is damaged.
 pub(super) fn read_config(folder: &Path) -> Result<(PathBuf, RunConfig)> {
     let path = folder.join(CONFIG);
+    if !path.exists() {
+        let advice = "there is no run; give a folder that has a config.toml, such as runs/quick/reach/sac/seed0";
+        return Err(Error::Config(format!("cannot read {}: {advice}", folder.display())));
+    }
     let config = RunConfig::read(&path)?;
     Ok((path, config))
 }
@@ -220,6 +247,10 @@ pub(super) fn read_config(folder: &Path) -> Result<(PathBuf, RunConfig)> {
 /// If the weights are missing, damaged, or those of another run.
 pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Method) -> Result<()> {
     let path = folder.join(WEIGHTS);
+    if !path.exists() {
+        let advice = "the run has saved no weights yet; let it train for longer";
+        return Err(Error::Config(format!("{}: {advice}", folder.display())));
+    }
     let loaded = method.checkpoint_mut().load_weights(&read_own(&path, config)?);
     loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))
 }
@@ -240,6 +271,9 @@ fn read_own(path: &Path, config: &RunConfig) -> Result<Weights> {
 /// # Errors
 /// If another holds the lock, or the folder cannot be written.
 fn lock(folder: &Path) -> Result<File> {
+    if folder.is_symlink() && !folder.exists() || folder.is_file() {
+        return Err(Error::Config(format!("{}: this is not a folder; choose another --out", folder.display())));
+    }
     std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
     let path = folder.join(LOCK);
     let file = OpenOptions::new().create(true).append(true).open(&path).map_err(Error::io("write", &path))?;
@@ -248,7 +282,7 @@ fn lock(folder: &Path) -> Result<File> {
         if !matches!(locked, Err(TryLockError::WouldBlock)) {
             break;
         }
-        // Perhaps somebody only looks whether it is locked: `is_open`.
+        // `is_open` takes the lock for a moment.
         std::thread::sleep(Duration::from_millis(10));
         locked = file.try_lock();
     }

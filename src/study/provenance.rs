@@ -82,7 +82,8 @@ fn versions(runs: &[Run]) -> Vec<String> {
     }
     let shown = |version: &&str| if version.is_empty() { "one that is not recorded".into() } else { quoted(version) };
     let shown: Vec<String> = versions.iter().map(shown).collect();
-    vec![if shown.is_empty() { "it is not recorded".into() } else { format!("there are {}", shown.join(", ")) }]
+    let none = versions.iter().all(|version| version.is_empty());
+    vec![if none { "it is not recorded".into() } else { format!("there are {}", shown.join(", ")) }]
 }
 
 /// The configurations, one for each method on a task, with the seeds and the versions of the program; folded, where a page can.
@@ -92,7 +93,8 @@ fn versions(runs: &[Run]) -> Vec<String> {
 pub(super) fn configurations(tables: &Tables) -> Result<String> {
     let mut text = String::new();
     let mut methods: Vec<(String, String)> = Vec::new();
-    let runs = tables.runs()?;
+    let mut runs = tables.runs()?;
+    runs.retain(|run| !run.configuration.is_empty());
     for run in &runs {
         let method = (run.task.clone(), run.method.clone());
         if methods.contains(&method) {

@@ -1,23 +1,29 @@
 //! The episodes that a report shows in 3D: of each method's median seed, the test episode with the median return and the one with
 //! the lowest. Weights are not in a study's tables, so the episodes are recorded when the study ends, next to the tables.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use flate2::read::GzDecoder;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use serde::{Deserialize, Serialize};
 
 use super::config::RunConfig;
 use super::evaluate::{ENVS, EpisodeResult};
 use super::folder::{is_complete, read_summary};
+use super::names::{check_name, excerpt};
 use super::page::gzip;
 use super::records::write_csv;
 use super::registry::Registry;
+use super::tables::Tables;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::watch::Recording;
 
 const TABLE: &str = "replays.csv";
 const COLUMNS: [&str; 8] = ["task", "method", "seed", "which", "episode", "return", "success", "file"];
+/// More bytes than a recording has when it is unpacked.
+const LARGEST: u64 = 1 << 28;
 
 /// A row of `replays.csv`: one recorded episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -45,8 +51,50 @@ pub(super) enum Which {
     Worst,
 }
 
-/// Records the episodes of a study's complete runs into `folder`, several at a time. What is there already, with the same return, stays.
-/// Answers what could not be recorded, each with the reason.
+impl Replay {
+    /// What the recording is called.
+    fn title(&self) -> String {
+        format!("{}, {}, seed {}, test episode {}", self.task, self.method, self.seed, self.episode)
+    }
+
+    /// Whether this is the return of the episode, apart from rounding.
+    fn has_return(&self, total: f64) -> bool {
+        (total - self.total).abs() <= 1e-6 * (1.0 + self.total.abs())
+    }
+
+    /// Reads the recording of this episode from the folder of the table.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or is another recording.
+    fn recorded(&self, folder: &Path) -> Result<Vec<u8>> {
+        #[derive(Deserialize)]
+        struct Recorded {
+            title: String,
+            frames: Vec<Frame>,
+        }
+        #[derive(Deserialize)]
+        struct Frame {
+            reward: f32,
+        }
+        let path = folder.join(&self.file);
+        let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
+        let mut json = Vec::new();
+        GzDecoder::new(bytes.as_slice()).take(LARGEST).read_to_end(&mut json).map_err(Error::io("unpack", &path))?;
+        let there: Recorded = serde_json::from_slice(&json).map_err(Error::data(&path))?;
+        let total: f64 = there.frames.iter().map(|frame| f64::from(frame.reward)).sum();
+        if there.title != self.title() || !self.has_return(total) {
+            let (title, wanted) = (excerpt(&there.title), self.title());
+            return Err(Error::data(&path)(format!(
+                "this is a recording of `{title}` with the return {total}, not of `{wanted}` with {}",
+                self.total
+            )));
+        }
+        Ok(bytes)
+    }
+}
+
+/// Records the episodes of a study's complete runs into `folder`, several at a time. What is recorded already, with the same return, stays.
+/// Returns what could not be recorded, each with the reason.
 ///
 /// # Errors
 /// If a file cannot be written.
@@ -57,9 +105,8 @@ pub fn record(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path)
     let outcomes: Vec<Result<Replay>> = episodes
         .into_par_iter()
         .map(|(replay, run)| {
-            let path = folder.join(&replay.file);
-            if !(recorded.contains(&replay) && path.is_file()) {
-                files::write(&path, &recording(registry, &replay, run)?)?;
+            if !recorded.contains(&replay) || replay.recorded(folder).is_err() {
+                files::write(&folder.join(&replay.file), &recording(registry, &replay, run)?)?;
             }
             Ok(replay)
         })
@@ -80,45 +127,101 @@ pub fn record(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path)
 ///
 /// # Errors
 /// If the table is damaged.
-pub(super) fn read(folder: &Path) -> Result<Vec<Replay>> {
+fn read(folder: &Path) -> Result<Vec<Replay>> {
     let path = folder.join(TABLE);
     if !path.exists() {
         return Ok(Vec::new());
     }
-    rows(&path)
+    let mut reader = csv::Reader::from_path(&path).map_err(Error::data(&path))?;
+    let header = reader.headers().map_err(Error::data(&path))?.clone();
+    let mut replays = Vec::new();
+    for row in reader.records() {
+        let row = row.map_err(Error::data(&path))?;
+        let line = row.position().map_or(0, csv::Position::line);
+        let replay: Replay = row.deserialize(Some(&header)).map_err(Error::data(&path))?;
+        check(&replay).map_err(|problem| Error::data(&path)(format!("line {line}: {problem}")))?;
+        replays.push(replay);
+    }
+    Ok(replays)
 }
 
-/// Copies the recordings to the folder of a report, if that is another.
+/// # Errors
+/// If the names could do harm: they become text of the report, and the file is read and written.
+fn check(replay: &Replay) -> Result<()> {
+    check_name("a task", &replay.task)?;
+    check_name("a method", &replay.method)?;
+    let name = replay.file.strip_prefix("replays/").and_then(|file| file.strip_suffix(".json.gz"));
+    let plain = |name: &str| name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
+    if name.is_some_and(|name| !name.is_empty() && plain(name)) {
+        return Ok(());
+    }
+    Err(Error::Config(format!(
+        "`file` is `{}`; it must be `replays/NAME.json.gz`, with letters (A to Z), digits, `-` and `_` in the name",
+        excerpt(&replay.file)
+    )))
+}
+
+/// The recordings of a study in the folder of its report, to which they are copied if that is another. Returns which are there, and what is
+/// wrong with the others.
 ///
 /// # Errors
-/// If a file cannot be read or written.
-pub(super) fn copy(replays: &[Replay], from: &Path, to: &Path) -> Result<()> {
-    for replay in replays.iter().filter(|_| to != from) {
-        let there = from.join(&replay.file);
-        files::write(&to.join(&replay.file), &std::fs::read(&there).map_err(Error::io("read", &there))?)?;
+/// If the table of recordings is damaged, or a file cannot be written.
+pub(super) fn of_report(tables: &Tables, from: &Path, to: &Path) -> Result<(Vec<Replay>, Vec<String>)> {
+    let (mut tested, mut problems) = (Vec::new(), Vec::new());
+    for replay in read(from)? {
+        let total = tables.test_return(&replay.task, &replay.method, replay.seed, replay.episode)?;
+        if total.is_some_and(|total| replay.has_return(total)) {
+            tested.push(replay);
+        } else {
+            problems.push(format!("{}: `{}` is not in the tests", from.join(TABLE).display(), replay.title()));
+        }
     }
-    Ok(())
+    let (there, others) = copy(tested, from, to)?;
+    problems.extend(others);
+    Ok((there, problems))
+}
+
+/// Copies the recordings to another folder, if it is another. Returns which are there, and what is wrong with the others.
+///
+/// # Errors
+/// If a file cannot be written.
+fn copy(replays: Vec<Replay>, from: &Path, to: &Path) -> Result<(Vec<Replay>, Vec<String>)> {
+    let (mut there, mut problems) = (Vec::new(), Vec::new());
+    for replay in replays {
+        match replay.recorded(from) {
+            Err(problem) => problems.push(problem.to_string()),
+            Ok(bytes) => {
+                if to != from {
+                    files::write(&to.join(&replay.file), &bytes)?;
+                }
+                there.push(replay);
+            }
+        }
+    }
+    Ok((there, problems))
 }
 
 /// Joins the recordings of several studies in the folder `to`, except those of methods that more than one of them has: the median seed of
-/// all is not known without the weights.
+/// all is not known without the weights. Returns what is wrong with recordings that cannot be used.
 ///
 /// # Errors
-/// If a file cannot be read or written.
-pub(super) fn join(folders: &[PathBuf], to: &Path) -> Result<()> {
+/// If a table of recordings is damaged, or a file cannot be written.
+pub(super) fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
     let mut studies = Vec::new();
     for folder in folders {
         studies.push((folder, read(folder)?));
     }
     let alike = |a: &Replay, b: &Replay| (&a.task, &a.method) == (&b.task, &b.method);
     let with = |replay: &Replay| studies.iter().filter(|(_, of)| of.iter().any(|other| alike(other, replay))).count();
-    let mut rows = Vec::new();
+    let (mut rows, mut problems) = (Vec::new(), Vec::new());
     for (folder, replays) in &studies {
-        let own: Vec<Replay> = replays.iter().filter(|replay| with(replay) == 1).cloned().collect();
-        copy(&own, folder, to)?;
-        rows.extend(own);
+        let own = replays.iter().filter(|replay| with(replay) == 1).cloned().collect();
+        let (there, others) = copy(own, folder, to)?;
+        rows.extend(there);
+        problems.extend(others);
     }
-    write_csv(&to.join(TABLE), &COLUMNS, rows.iter())
+    write_csv(&to.join(TABLE), &COLUMNS, rows.iter())?;
+    Ok(problems)
 }
 
 /// The recorded episodes of a task, a row for each method.
@@ -129,10 +232,15 @@ pub(super) fn table(replays: &[Replay], task: &str) -> String {
         let Replay { method, seed, episode, total, file, .. } = replay;
         format!("[{total:.1}, {outcome}]({file} \"{method} on {task}, seed {seed}, test episode {episode}\")")
     };
-    let rows = of_task.iter().filter(|replay| replay.which == Which::Median).map(|median| {
-        let worst = of_task.iter().find(|other| other.which == Which::Worst && other.method == median.method);
-        let worst = worst.map_or("-".into(), |worst| link(worst));
-        format!("| {} | {} | {} | {worst} |\n", median.method, median.seed, link(median))
+    // One of the two may be missing.
+    let first_of_method =
+        |(i, replay): &(usize, &&Replay)| of_task[..*i].iter().all(|other| other.method != replay.method);
+    let rows = of_task.iter().enumerate().filter(first_of_method).map(|(_, Replay { method, seed, .. })| {
+        let [median, worst] = [Which::Median, Which::Worst].map(|which| {
+            let replay = of_task.iter().find(|other| other.which == which && other.method == *method);
+            replay.map_or("-".into(), |replay| link(replay))
+        });
+        format!("| {method} | {seed} | {median} | {worst} |\n")
     });
     let rows: String = rows.collect();
     if rows.is_empty() {
@@ -205,12 +313,11 @@ fn chosen(runs: &[(RunConfig, PathBuf)]) -> Vec<(Replay, &Path)> {
 fn recording(registry: &Registry, replay: &Replay, run: &Path) -> Result<Vec<u8>> {
     let (config, mut method) = registry.trained_method(run)?;
     let (env, episode) = (registry.make_env(&config)?, replay.episode - 1);
-    let title = format!("{}, {}, seed {}, test episode {}", replay.task, replay.method, replay.seed, replay.episode);
     let seed = config.starts.test().seed(episode)?;
     // In the place among the test's environments that it had: the random numbers of a planner depend on it.
-    let recording = Recording::of_slot(title, env, &mut method, seed, episode % ENVS)?;
+    let recording = Recording::of_slot(replay.title(), env, &mut method, seed, episode % ENVS)?;
     let total = recording.total();
-    if (total - replay.total).abs() > 1e-6 * (1.0 + replay.total.abs()) {
+    if !replay.has_return(total) {
         return Err(Error::Config(format!(
             "{}: test episode {} has a return of {total} when it is recorded, and {} in `test.csv`; is this the program that made the run?",
             run.display(),

@@ -27,6 +27,8 @@ use std::time::{Duration, Instant};
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Evaluator};
 use super::folder::RunFolder;
+#[cfg(feature = "cli")]
+pub(crate) use super::folder::check_run;
 pub use super::folder::{is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
@@ -45,7 +47,7 @@ const CHECKPOINT_EVERY: [Duration; 2] = [Duration::from_secs(1), Duration::from_
 /// What happened in a [`Run::step`].
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// Nothing worth a line.
+    /// A time step after which neither an episode ended nor an evaluation followed.
     Stepped,
     /// A training episode ended.
     EpisodeEnded(EpisodeRow),
@@ -71,7 +73,7 @@ pub struct Run<E> {
     evaluated_at: Option<usize>,
     clock: Instant,
     last_save: Instant,
-    /// How long that took.
+    /// How long the last save took.
     saving: Duration,
 }
 

@@ -10,10 +10,10 @@ use super::run::{Event, is_complete};
 use super::starts::{LIMIT, check_below};
 use crate::error::{Error, Result};
 
-/// More runs than anybody waits for.
+/// The largest number of runs in a study: guards against a mistyped range of seeds.
 pub const MOST_RUNS: u64 = 100_000;
 
-/// How much a study takes on.
+/// The size of a study.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Profile {
     /// A few minutes: what [`Registry::quick_study`] says, two seeds.
@@ -117,7 +117,7 @@ impl StudyPlan {
     }
 }
 
-/// Is told how the runs go. Calls come from several threads.
+/// Receives the progress of the runs. Calls come from several threads.
 pub trait StudyObserver: Sync {
     /// A run begins, or goes on after `done` steps.
     fn started(&self, run: usize, config: &RunConfig, done: usize);
@@ -126,10 +126,10 @@ pub trait StudyObserver: Sync {
 }
 
 /// Carries one run to its end, or until `stop` is set: then the present episode is finished, the run is
-/// saved, and the answer is [`Error::Interrupted`].
+/// saved, and [`Error::Interrupted`] is returned.
 ///
 /// # Errors
-/// What the run answers, and [`Error::Interrupted`].
+/// Any error of the run, and [`Error::Interrupted`].
 pub fn carry_out(
     registry: &Registry,
     index: usize,
@@ -171,21 +171,23 @@ pub fn carry_out_all(
     observer: &dyn StudyObserver,
     stop: &AtomicBool,
 ) -> Result<()> {
+    let jobs = jobs.clamp(1, runs.len().max(1));
     let next = AtomicUsize::new(0);
     let failure = Mutex::new(None);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     std::thread::scope(|scope| {
-        for _ in 0..jobs.clamp(1, runs.len().max(1)) {
+        for _ in 0..jobs {
             scope.spawn(|| {
                 let pool = rayon::ThreadPoolBuilder::new()
                     .num_threads((cores / jobs).max(1))
                     .build()
                     .expect("threads for a run");
-                while let Some((config, folder)) = runs.get(next.fetch_add(1, Ordering::SeqCst)) {
-                    if is_complete(folder, config) {
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some((config, folder)) = runs.get(index) else { break };
+                    if is_complete(folder, &registry.as_begun(config, folder)) {
                         continue;
                     }
-                    let index = runs.iter().position(|(_, other)| other == folder).expect("a run of this study");
                     if let Err(error) = pool.install(|| carry_out(registry, index, config, folder, observer, stop)) {
                         // First the reason, then the signal: the others will answer that they were interrupted.
                         failure.lock().expect("no panic holds it").get_or_insert(error);

@@ -21,9 +21,9 @@ use super::statistics::mean;
 
 /// Speeds below this fraction of the top speed count as rest.
 const REST: f64 = 0.05;
-/// SPARC uses frequencies up to this, in Hz (and never beyond half the sampling rate),
+/// The highest frequency that SPARC uses, in Hz; never more than half the sampling rate.
 const CUT_OFF: f64 = 10.0;
-/// from the first to the last of them whose magnitude is at least this fraction of the largest.
+/// SPARC uses the frequencies between the first and the last whose magnitude is at least this fraction of the largest.
 const THRESHOLD: f64 = 0.05;
 
 /// Smoothness of a path of hand positions (m) sampled every `dt` seconds: [`sparc`] and [`ldlj`], both dimensionless,

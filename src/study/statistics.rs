@@ -115,8 +115,8 @@ pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rn
 }
 
 /// The 95 % interval, `[low, high]`, of a method's mean over seeds and episodes, by the two-level bootstrap: seeds are drawn
-/// with replacement, then episodes within each drawn seed. `tasks[i][k]` holds what the episodes of seed `k` on task `i`
-/// brought (1 for a success). Tasks are not drawn; each counts the same, however many episodes it has.
+/// with replacement, then episodes within each drawn seed. `tasks[i][k]` holds the outcomes of the episodes of seed `k` on
+/// task `i` (1 for a success). Tasks are not drawn; each counts the same, however many episodes it has.
 ///
 /// Davison & Hinkley, "Bootstrap methods and their application" (1997), section 3.8. With five seeds it covers the truth in
 /// 85 to 95 % of cases, the less the more the seeds differ, and with fewer seeds less often: [`t_interval`] is the wider
@@ -193,7 +193,7 @@ fn squared_error(values: &[f64]) -> f64 {
 
 /// The difference of the means of two methods that met the same starts, first minus second, and its 95 % interval by the
 /// crossed ("pigeonhole") bootstrap: the seeds of the first, the seeds of the second, and the starts are drawn independently,
-/// with replacement. `first[k][i]` is what seed `k` brought from start `i`. Starts that only one of them met are left out.
+/// with replacement. `first[k][i]` is the outcome of seed `k` from start `i`. Starts that only one of them met are left out.
 ///
 /// Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1 (2007). Mildly conservative.
 ///
@@ -281,8 +281,8 @@ pub fn area_under_curve(steps: &[f64], success: &[f64], budget: f64) -> f64 {
 /// evaluation, or at the last evaluation. `None` if there is none: the run is right-censored at its budget.
 ///
 /// What lies between two evaluations is not known, so this is the step *by* which the level is reached. Two evaluations have
-/// to agree because each has few episodes: of 20, a policy that succeeds in 70 % brings 80 % home with probability 0.24, and a
-/// learning curve gives it many chances.
+/// to agree because each has few episodes: with 20, a policy whose true success rate is 70 % scores at least 80 % with probability
+/// 0.24, and a learning curve repeats that test many times.
 #[doc(alias = "sample efficiency")]
 #[doc(alias = "steps to threshold")]
 pub fn steps_to(level: f64, steps: &[f64], success: &[f64]) -> Option<f64> {

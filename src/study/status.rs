@@ -28,7 +28,7 @@ use super::folder::{is_complete, is_open};
 pub enum RunState {
     /// Not begun.
     Waiting,
-    /// Begun, and nobody carries it on.
+    /// Begun; no process is running it.
     Stopped,
     /// A process works on it.
     Running,
@@ -99,7 +99,8 @@ fn last_episode(path: &Path) -> Option<(usize, f64)> {
     let column = |name| headers.iter().position(|header| header == name);
     let (step, seconds) = (column("step")?, column("seconds")?);
     let last = reader.records().filter_map(Result::ok).last()?;
-    Some((last.get(step)?.parse().ok()?, last.get(seconds)?.parse().ok()?))
+    let seconds: f64 = last.get(seconds)?.parse().ok()?;
+    Some((last.get(step)?.parse().ok()?, if seconds.is_finite() { seconds.max(0.0) } else { 0.0 }))
 }
 
 #[cfg(test)]
@@ -119,5 +120,14 @@ mod tests {
         assert_eq!(time_left(&runs, 4), Some(20.0), "the longest run is not shared");
         assert_eq!(time_left(&[run("sac", 0, 0.0), run("pets", 900, 90.0)], 1), None, "no pace of SAC is known");
         assert_eq!(time_left(&runs[..1], 1), None, "nothing is missing");
+    }
+
+    #[test]
+    fn seconds_that_cannot_be_true_are_none() {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        for (seconds, expected) in [("2.5", 2.5), ("inf", 0.0), ("NaN", 0.0), ("-5", 0.0)] {
+            std::fs::write(file.path(), format!("step,seconds\n100,{seconds}\n")).expect("a writable file");
+            assert_eq!(last_episode(file.path()), Some((100, expected)), "{seconds}");
+        }
     }
 }

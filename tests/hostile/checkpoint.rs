@@ -96,6 +96,54 @@ fn a_checkpoint_knows_its_run() {
     assert!(said.contains("weights.safetensors: it belongs to another run (its `seed` is 1, not 0)"), "{said}");
 }
 
+/// A folder with weights but no checkpoint, such as one of `data/trained`, is not trained in from the start. A command that is
+/// refused leaves nothing behind.
+#[test]
+fn what_was_learned_is_not_overwritten() {
+    let config = small("small-sac", 0);
+    let folder = begun(&config);
+    let here = folder.path();
+    fs::remove_file(here.join("config.toml")).expect("a writable folder");
+    let said = problem(open(&small("small-sac", 1), here));
+    assert!(said.contains("it belongs to another run") && !here.join("config.toml").exists(), "{said}");
+    drop(open(&config, here).expect("the run to which the checkpoint belongs"));
+    let weights = fs::read(here.join(WEIGHTS)).expect("weights");
+    fs::remove_file(here.join(STATE)).expect("a writable folder");
+    let said = problem(open(&config, here));
+    assert!(said.contains("trained weights without a checkpoint"), "{said}");
+    assert_eq!(fs::read(here.join(WEIGHTS)).expect("weights"), weights);
+}
+
+/// A run is complete, and remains one of its version, also if settings have been added since.
+#[test]
+fn a_complete_run_of_an_earlier_version_is_left_alone() {
+    let (folder, config) = (tempfile::tempdir().expect("a folder"), small("small-sac", 0));
+    let here = folder.path();
+    finish(&config, here).expect("a healthy run");
+    let edit = |file: &str, change: &dyn Fn(&str) -> Option<String>| {
+        let text = fs::read_to_string(here.join(file)).expect(file);
+        let lines = text.lines().filter_map(change).map(|line| line + "\n");
+        fs::write(here.join(file), lines.collect::<String>()).expect("a writable folder");
+    };
+    let not = |start: &'static str| move |line: &str| (!line.starts_with(start)).then(|| line.to_string());
+    edit("config.toml", &not("hindsight ="));
+    edit("config.toml", &not("values ="));
+    let version = "version = \"0.0.9\"";
+    edit("summary.toml", &|line| Some(if line.starts_with("version =") { version.into() } else { line.into() }));
+    let summary = || fs::read_to_string(here.join("summary.toml")).expect("a summary");
+    let before = summary();
+    assert!(before.contains(version) && !is_complete(here, &config), "the configurations differ: {before}");
+    let runs = [(config.clone(), here.to_path_buf())];
+    let carry_out = || carry_out_all(&registry(), &runs, 1, &Silent, &AtomicBool::new(false)).expect("a healthy run");
+    carry_out();
+    assert_eq!(summary(), before);
+    // What is written anew is still what that version made.
+    fs::remove_file(here.join("values.csv")).expect("a writable folder");
+    fs::remove_file(here.join(STATE)).expect("a writable folder");
+    carry_out();
+    assert_eq!(summary(), before);
+}
+
 struct Silent;
 
 impl StudyObserver for Silent {

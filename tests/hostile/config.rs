@@ -247,7 +247,7 @@ fn numbers_must_fit_together() {
         ("pets", "pets.control.replan_every = 9", "`pets`: `control.replan_every` must not exceed"),
         ("pets", "pets.planner.icem.population = 1000000\npets.particles = 10000", "do not fit into memory"),
         ("sac", "sac.hidden = [4096, 4096]\nsac.critics = 32", "too many weights"),
-        ("dreamer", "dreamer.replay = 20", "`dreamer`: `replay` must hold at least `length` time steps"),
+        ("dreamer", "dreamer.replay = 20", "`dreamer`: `replay` must hold at least `length` decisions"),
         ("dreamer", "dreamer.train_ratio = 1e6", "`dreamer`: `train_ratio` must not exceed"),
         ("tdmpc2", "tdmpc2.model.group = 7", "`tdmpc2.model`: `group` must divide `latent`"),
         ("tdmpc2", "tdmpc2.planner.elites = 1000", "`tdmpc2.planner`: `elites` must not exceed `population`"),

@@ -10,6 +10,7 @@ use proptest::test_runner::{RngAlgorithm, TestCaseError, TestRng, TestRunner};
 
 mod checkpoint;
 mod config;
+mod studies;
 mod tables;
 
 /// What a case may take, on a machine that does other things as well.

@@ -519,7 +519,7 @@ fn configurations_and_reasons_are_quoted() {
     for empty in ["evaluations.csv", "models.csv", "values.csv"] {
         write(empty, String::new());
     }
-    write("runs.csv", format!("task,method,seed,version,configuration\na,b,0,\"{evil}\",\"{evil}\"\n"));
+    write("runs.csv", format!("task,method,seed,version,configuration\na,b,0,\"{evil}\",\"a = '''{evil}'''\"\n"));
     write("left_out.csv", format!("run,reason\n\"{evil}\",\"{evil}\"\n"));
     report::write(folder.path(), folder.path()).expect("a report");
     let page = std::fs::read_to_string(folder.path().join("report.html")).expect("a page");
@@ -528,7 +528,12 @@ fn configurations_and_reasons_are_quoted() {
     for (file, text, problem) in [
         ("runs.csv", "task,method,seed,version\na,b,0,1\n", "no column `configuration`"),
         ("runs.csv", "task,method,seed,version,configuration\na,b,0,1,c\na,b,0,1,c\n", "a row is doubled"),
-        ("runs.csv", "task,method,seed,version,configuration\na,c,0,1,c\n", "is not in its tests"),
+        ("runs.csv", "task,method,seed,version,configuration\na,b,0,1,\na,c,0,1,\n", "is not in its tests"),
+        (
+            "runs.csv",
+            "task,method,seed,version,configuration\na,b,0,1,c\n",
+            "its configuration in runs.csv is not TOML",
+        ),
         ("left_out.csv", "run\na\n", "no column `reason`"),
     ] {
         let before = std::fs::read(folder.path().join(file)).expect("a table");

@@ -91,7 +91,7 @@ impl ActorCritic {
     #[doc(alias = "Polyak averaging")]
     #[doc(alias = "EMA")]
     pub fn update_target(&self, target: &mut TargetCritic) {
-        polyak(target, &self.critic, self.config.slow_rate);
+        polyak(target, &self.critic, self.config.target_rate);
     }
 
     pub(super) fn distribution(&self, head: &[f32], i: usize) -> BoundedNormal {

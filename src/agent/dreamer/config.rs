@@ -32,12 +32,12 @@ pub struct DreamerConfig {
     pub learning_warm_up: u32,
     /// Sequences of an update.
     pub batch: usize,
-    /// Time steps of each sequence.
+    /// Decisions in each sequence.
     pub length: usize,
-    /// Time steps of each sequence from which rollouts are imagined: the last ones, whose latent states have seen most; all
+    /// Decisions of each sequence from which rollouts are imagined: the last ones, whose latent states have seen most; all
     /// of them if left out. Imagination is most of an update's cost.
     pub dreams: Option<usize>,
-    /// The replay ratio: replayed time steps for each step in the environment, so that there are
+    /// The replay ratio: replayed decisions for each time step in the environment, so that there are
     /// `train_ratio / (batch x length)` updates a step.
     #[doc(alias = "replay ratio")]
     #[doc(alias = "update-to-data ratio")]
@@ -51,7 +51,7 @@ pub struct DreamerConfig {
     /// Exponent beta of the coloured noise by which actions are drawn from the policy while it explores: 0 is white, as in
     /// the published code. Temporally correlated noise moves a hand farther (Eberhard et al. 2023).
     pub exploration_noise_beta: f64,
-    /// Capacity of the replay buffer, in time steps.
+    /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
 }
 
@@ -100,7 +100,7 @@ ranges!(DreamerConfig {
 require batch.is_multiple_of(PARTS) => "`batch` must be even";
 require dreams.is_none_or(|dreams| dreams <= *length) => "`dreams` must not exceed `length`";
 require *warm_up > length * action_repeat => "`warm_up` must be more than `length` decisions";
-require replay >= length => "`replay` must hold at least `length` time steps";
+require replay >= length => "`replay` must hold at least `length` decisions";
 require *train_ratio <= (100 * batch * length) as f32 => "`train_ratio` must not exceed 100 times `batch` times `length`";
 require planner.as_ref().is_none_or(|planner| control.suits(planner)) =>
     "`control.replan_every` must not exceed the planner's `horizon`";
@@ -132,7 +132,7 @@ pub struct ActorCriticConfig {
     pub units: usize,
     /// Hidden layers of actor and critic.
     pub layers: usize,
-    /// Time steps of an imagined rollout, H.
+    /// Decisions of an imagined rollout, H.
     pub horizon: usize,
     /// Lambda of the [lambda-returns](super::lambda_returns): 0 bootstraps after one step, 1 at the end of the rollout.
     pub lambda: f32,
@@ -147,7 +147,7 @@ pub struct ActorCriticConfig {
     pub min_std: f32,
     /// Rate of the target network's exponential moving average, per update.
     #[doc(alias = "target network")]
-    pub slow_rate: f32,
+    pub target_rate: f32,
     /// Weight of the critic's loss on replayed experience.
     pub replayed: f32,
 }
@@ -163,7 +163,7 @@ impl Default for ActorCriticConfig {
             gradient: ActorGradient::default(),
             center_advantages: false,
             min_std: 0.1,
-            slow_rate: 0.02,
+            target_rate: 0.02,
             replayed: 0.3,
         }
     }
@@ -178,6 +178,6 @@ ranges!(ActorCriticConfig {
     gradient: Any,
     center_advantages: Any,
     min_std: 1e-4..=0.999,
-    slow_rate: 0.0..=1.0,
+    target_rate: 0.0..=1.0,
     replayed: 0.0..=1e3,
 });

@@ -40,7 +40,7 @@ use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::{KnownReward, Spec};
 use crate::error::{Error, Result};
 use crate::model::{Dynamics, Ensemble};
-use crate::plan::{ActionSequences, Iteration, MakePlanner};
+use crate::plan::{ActionSequences, Iteration, MakePlanner, spread};
 use crate::replay::{ReplayBuffer, Transition};
 use crate::rng::{self, Rng};
 use crate::settings::Ranges;
@@ -152,7 +152,7 @@ impl Pets {
     }
 
     /// The same agent with a planner of the caller's own instead of `config.planner`: a [`MakePlanner`], for example a
-    /// closure from the numbers in an action to a [`Planner`](crate::plan::Planner).
+    /// closure from the dimension of an action to a [`Planner`](crate::plan::Planner).
     #[must_use]
     pub fn with_planner(self, planner: impl MakePlanner + 'static) -> Self {
         let controllers = MakeController { planner: Box::new(planner), ..self.controllers };
@@ -225,13 +225,11 @@ impl Agent for Pets {
         let Some(dynamics) = dynamics else { return (vec![0.0; spec.action_size], Vec::new()) };
         let model = PlanningModel::new(config, dynamics, reward.as_deref());
         let controller = states.states(&[*slot], |i| controllers.of_slot(i)).remove(0);
-        // A few of each iteration's candidates, from the best to the worst.
         let mut shown: Option<ActionSequences> = None;
         let mut observer = |iteration: &Iteration| {
             let candidates = iteration.candidates;
-            let mut order: Vec<usize> = (0..candidates.count()).collect();
-            order.sort_by(|a, b| iteration.returns[*b].total_cmp(&iteration.returns[*a]));
-            let some = order.iter().step_by((candidates.count() / SHOWN).max(1)).flat_map(|&i| candidates.row(i));
+            let order = spread(iteration, SHOWN);
+            let some = order.iter().flat_map(|&i| candidates.row(i));
             let shown = shown.get_or_insert_with(|| ActionSequences::new(candidates.horizon, candidates.actions));
             // The last iteration, which has the best candidates, comes first.
             shown.values.splice(0..0, some.copied());

@@ -44,8 +44,8 @@ pub struct SacConfig {
     /// Polyak averaging rate of the target critics (the target network), per critic update.
     #[doc(alias = "tau")]
     #[doc(alias = "target network")]
-    pub polyak: f32,
-    /// Capacity of the replay buffer, in transitions.
+    pub target_rate: f32,
+    /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
     /// Time steps of random actions before the first update.
     pub warm_up: usize,
@@ -96,7 +96,7 @@ impl Default for SacConfig {
             batch: 256,
             discount: 0.99,
             discount_from_horizon: false,
-            polyak: 0.005,
+            target_rate: 0.005,
             replay: 1_000_000,
             warm_up: 1000,
             warm_up_noise_beta: None,
@@ -132,7 +132,7 @@ ranges!(SacConfig {
     batch: 1..=65_536,
     discount: 0.0..=1.0,
     discount_from_horizon: Any,
-    polyak: 0.0..=1.0,
+    target_rate: 0.0..=1.0,
     replay: 1..=100_000_000,
     warm_up: 0..=1_000_000_000,
     warm_up_noise_beta: 0.0..=10.0,

@@ -94,7 +94,7 @@ pub struct Sac {
     /// Coloured noise of the warm-up, and of the policy after it.
     warm_up_noise: Option<RandomActions>,
     exploration_noise: Option<RandomActions>,
-    /// The action that is held, and what it has brought so far.
+    /// The action that is held, and its transitions so far.
     held: Held,
     decision: Decision,
     /// The actions held in the environments that it is evaluated in.
@@ -241,7 +241,7 @@ impl Sac {
         if let Some([_, lasso]) = &self.lassos {
             lasso.step(&mut self.critics, self.config.learning_rate);
         }
-        polyak(&mut self.target_critics, &self.critics, self.config.polyak);
+        polyak(&mut self.target_critics, &self.critics, self.config.target_rate);
         Losses::from([("critic_loss", critic_loss), ("critic_gradient", norm), ("q", mean_q)])
     }
 

@@ -3,13 +3,13 @@
 use serde::{Deserialize, Serialize};
 
 use crate::agent::discount_for;
-use crate::model::ImplicitConfig;
+use crate::model::{EntropyBonus, ImplicitConfig};
 use crate::plan::GuidedConfig;
 use crate::settings::{fits, ranges};
 
 /// Settings of [`TdMpc2`](super::TdMpc2). [`Preset`](crate::agent::Preset) has tuned ones. The defaults are the published
-/// constants, but for a smaller batch (256), smaller networks, two critics (5), and a warm-up of 1000 steps (there five episodes,
-/// if that is more).
+/// constants, except for the batch (128; published 256), smaller networks, the number of critics (2; published 5) and the warm-up
+/// (1,000 steps; published five episodes, if that is more).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TdMpc2Config {
@@ -66,6 +66,8 @@ pub struct TdMpc2Config {
     pub target_rate: f32,
     /// Weight of the entropy bonus in the policy's loss.
     pub entropy: f32,
+    /// Whose entropy that is.
+    pub entropy_bonus: EntropyBonus,
     /// The world model.
     pub model: ImplicitConfig,
     /// The planner.
@@ -93,6 +95,7 @@ impl Default for TdMpc2Config {
             max_gradient_norm: 20.0,
             target_rate: 0.01,
             entropy: 1e-4,
+            entropy_bonus: EntropyBonus::default(),
             model: ImplicitConfig::default(),
             planner: GuidedConfig::default(),
         }
@@ -126,6 +129,7 @@ ranges!(TdMpc2Config {
     max_gradient_norm: 1e-6..=1e9,
     target_rate: 0.0..=1.0,
     entropy: 0.0..=1e6,
+    entropy_bonus: Any,
     model: Nested,
     planner: Nested,
 }

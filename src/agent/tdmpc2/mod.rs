@@ -37,7 +37,7 @@ use crate::error::Result;
 use crate::model::implicit::FrozenModel;
 use crate::model::{ImplicitModel, PolicyPrior, Probe};
 use crate::nn::{Adam, AdamConfig, Mlp, copy_parameters, parameters_of_fields};
-use crate::plan::Iteration;
+use crate::plan::{Iteration, spread};
 use crate::replay::{SequenceReplay, Transition};
 use crate::rng::{self, Rng};
 use crate::settings::Ranges;
@@ -107,7 +107,7 @@ struct Networks {
     /// The target network: follows the critics slowly.
     target: Mlp,
     probe: Probe,
-    /// Numbers in an action.
+    /// Dimension of an action.
     actions: usize,
 }
 
@@ -214,12 +214,10 @@ impl Agent for TdMpc2 {
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
         let (world, _, controllers, fresh) = self.imagined();
         let controller = controllers.states(&[*slot], fresh).remove(0);
-        // A few of each iteration's candidates, from the best to the worst; those of the last iteration come first.
+        // The last iteration, which has the best candidates, comes first.
         let (mut sequences, mut returns) = (Vec::new(), Vec::new());
         let mut observer = |iteration: &Iteration| {
-            let mut order: Vec<usize> = (0..iteration.returns.len()).collect();
-            order.sort_by(|a, b| iteration.returns[*b].total_cmp(&iteration.returns[*a]));
-            order = order.into_iter().step_by((iteration.returns.len() / SHOWN).max(1)).collect();
+            let order = spread(iteration, SHOWN);
             sequences.splice(0..0, order.iter().flat_map(|&i| iteration.candidates.row(i)).copied());
             returns.splice(0..0, order.iter().map(|&i| iteration.returns[i]));
         };

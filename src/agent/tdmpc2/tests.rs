@@ -4,7 +4,7 @@ use dfdx::tensor::Gradients;
 use super::*;
 use crate::agent::Diagnostics;
 use crate::env::{Feature, Task};
-use crate::model::ImplicitConfig;
+use crate::model::{EntropyBonus, ImplicitConfig};
 use crate::nn::two_hot::symexp;
 use crate::nn::{Parameters, TapeOps, Tensor3, device, ops, values, values_mut};
 use crate::plan::GuidedConfig;
@@ -105,7 +105,7 @@ fn an_update_is_the_references() {
     values(&z).iter().zip(expected).for_each(|(z, expected)| near("z", *z, expected));
 
     let encoded = NoneTape.rows(&z, 2, 4);
-    let actions = policy.sample_on(&mut NoneTape, &encoded, &noise[..8]).0;
+    let actions = policy.sample_on(&mut NoneTape, &encoded, &noise[..8], EntropyBonus::Gaussian).0;
     let q = model.values(&target.some(&device(), &pair), &encoded, &actions);
     let targets = update::bootstrapped(&batch, &q, 0.95, 1);
     targets.iter().zip([0.981_567, 0.452_613, 0.030_633, 0.663_528]).for_each(|(y, expected)| near("y", *y, expected));
@@ -135,7 +135,7 @@ fn an_update_is_the_references() {
     let mut tape = OwnedTape::default();
     let latents = NoneTape.stack(&loss.latents);
     let mut scale = RunningScale::default();
-    let loss = networks.climb(&mut tape, &latents, &noise, pair, 2, 1e-4, &mut scale);
+    let loss = networks.climb(&mut tape, &latents, &noise, pair, 2, &TdMpc2Config::default(), &mut scale);
     near("policy", ops::mean(&loss.climb) + ops::mean(&loss.entropy), -0.000_994);
     let gradients = ops::total(tape, &[(1.0, loss.climb), (1.0, loss.entropy)]).backward();
     near("policy's gradient", norm(&gradients, policy.parameters().into_iter().map(|(_, p)| p)), 0.310_840);
@@ -257,7 +257,8 @@ fn the_policy_leaves_the_model_alone() {
     let z = networks.model.encode(&batch().obs);
     let mut tape = OwnedTape::default();
     let mut scale = RunningScale::default();
-    let loss = networks.policy_loss(&mut tape, &z, 2, 1e-4, &mut scale, &mut rng::stream(0, "alone"));
+    let loss =
+        networks.policy_loss(&mut tape, &z, 2, &TdMpc2Config::default(), &mut scale, &mut rng::stream(0, "alone"));
     let mut gradients = ops::total(tape, &[(1.0, loss.climb), (1.0, loss.entropy)]).backward();
     for (name, parameter) in networks.model.parameters() {
         assert!(gradients.get_or_alloc_mut(parameter).expect("memory").iter().all(|g| *g == 0.0), "{name}");

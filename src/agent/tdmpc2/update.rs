@@ -4,7 +4,7 @@
 use dfdx::prelude::*;
 
 use super::planning::two_of;
-use super::{Networks, RunningScale, TdMpc2};
+use super::{Networks, RunningScale, TdMpc2, TdMpc2Config};
 use crate::agent::Losses;
 use crate::model::implicit::{normals, step_weights};
 use crate::nn::{Grad, TapeOps, Tensor3, ops, polyak, values};
@@ -13,7 +13,7 @@ use crate::rng::Rng;
 
 impl TdMpc2 {
     /// One update on freshly drawn slices of `horizon` steps; `None` while no episode is that long. Returns the means of
-    /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `target`, the mean value target, `q`, the mean value of the
+    /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `policy_entropy`, in nats; `target`, the mean value target, `q`, the mean value of the
     /// policy's actions, and `value_scale`, all three in multiples of [`TdMpc2Config::reward_unit`](super::TdMpc2Config::reward_unit);
     /// `targets_beyond_bins`, the share of targets that no bin holds (more than a few: raise `bin_limit`); `latent_drift`
     /// ([`drift`](crate::model::ImplicitLoss::drift)); and the norms of the gradients before clipping.
@@ -41,8 +41,9 @@ impl TdMpc2 {
         // The policy, on latent states that are data to it.
         let latents = NoneTape.stack(&loss.latents);
         let mut tape = OwnedTape::default();
-        let policy = networks.policy_loss(&mut tape, &latents, batch.sequences, config.entropy, scale, rng);
+        let policy = networks.policy_loss(&mut tape, &latents, batch.sequences, config, scale, rng);
         losses.insert("policy_loss", ops::mean(&policy.climb) + ops::mean(&policy.entropy));
+        losses.insert("policy_entropy", policy.nats);
         losses.insert("q", policy.q);
         losses.insert("value_scale", scale.scale());
         let mut gradients = ops::total(tape, &[(1.0, policy.climb), (1.0, policy.entropy)]).backward();
@@ -68,6 +69,8 @@ pub(super) struct PolicyLoss {
     pub climb: Tensor3,
     /// Minus the weighted entropy bonus: `[1, rows, 1]`.
     pub entropy: Tensor3,
+    /// The mean entropy, in nats.
+    pub nats: f32,
     /// The mean value.
     pub q: f32,
 }
@@ -110,13 +113,13 @@ impl Networks {
         tape: &mut OwnedTape<f32, Cpu>,
         z: &Tensor3,
         sequences: usize,
-        entropy: f32,
+        config: &TdMpc2Config,
         scale: &mut RunningScale,
         rng: &mut Rng,
     ) -> PolicyLoss {
         let noise = normals(z.shape().1 * self.actions, rng);
         let pair = two_of(self.model.config().critics, rng);
-        self.climb(tape, z, &noise, pair, sequences, entropy, scale)
+        self.climb(tape, z, &noise, pair, sequences, config, scale)
     }
 
     /// [`Networks::policy_loss`] with everything drawn: standard normal `noise`, `[rows, actions]`, and the two critics.
@@ -128,12 +131,12 @@ impl Networks {
         noise: &[f32],
         pair: [usize; 2],
         sequences: usize,
-        entropy: f32,
+        config: &TdMpc2Config,
         scale: &mut RunningScale,
     ) -> PolicyLoss {
         let Self { model, policy, .. } = self;
         let rows = z.shape().1;
-        let (action, bonus) = policy.sample_on(tape, z, noise);
+        let (action, bonus) = policy.sample_on(tape, z, noise, config.entropy_bonus);
         let pair = model.critics().some(model.device(), &pair);
         let input = tape.record(&action, |action| {
             let (action, tape) = action.split_tape();
@@ -147,7 +150,8 @@ impl Networks {
         let times = |factor: f32| weights.iter().map(|weight| -factor * weight).collect::<Vec<f32>>();
         PolicyLoss {
             climb: tape.scale_rows(&q, &times(1.0 / scale.scale())),
-            entropy: tape.scale_rows(&bonus, &times(entropy)),
+            entropy: tape.scale_rows(&bonus, &times(config.entropy)),
+            nats: ops::mean(&bonus) / self.actions as f32,
             q: ops::mean(&q),
         }
     }

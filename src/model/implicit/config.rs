@@ -9,9 +9,9 @@ use crate::settings::{fits, ranges};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ImplicitConfig {
-    /// Numbers in a latent state.
+    /// Dimension of a latent state.
     pub latent: usize,
-    /// Numbers in each of its groups, the softmaxes of [`sim_norm`](crate::nn::simnorm::sim_norm).
+    /// Dimension of each of its groups, the softmaxes of [`sim_norm`](crate::nn::simnorm::sim_norm).
     pub group: usize,
     /// Units of the encoder's hidden layer.
     pub encoder: usize,

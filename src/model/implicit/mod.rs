@@ -41,8 +41,8 @@ use dfdx::tensor::Cpu;
 pub use config::ImplicitConfig;
 pub(crate) use frozen::FrozenModel;
 pub use loss::{ImplicitLoss, step_weights};
-pub use policy::PolicyPrior;
 pub(crate) use policy::normals;
+pub use policy::{EntropyBonus, PolicyPrior};
 pub use probe::{Probe, Probed};
 
 use super::features::LatentFeatures;

@@ -3,13 +3,27 @@
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
+use serde::{Deserialize, Serialize};
 
-use crate::nn::kernels::tanh;
+use crate::nn::kernels::{softplus, tanh};
 use crate::nn::{Grad, Mlp, TapeOps, Tensor3, ops, parameters_of_fields, tensor, values};
 use crate::rng::{self, Rng};
 
 /// Bounds of the logarithm of the standard deviation.
 const LOG_STD: [f32; 2] = [-10.0, 2.0];
+
+/// Whose entropy the policy's bonus is, with `u = m + std noise` and `a = tanh(u)`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EntropyBonus {
+    /// Of u, `-ln N(u; m, std)`, as in the newest published code. Its gradient is constant in `ln std`, and none pulls m back, so
+    /// with a weight far above the published 1e-4 the policy saturates: std grows to its bound, and actions to -1 or 1.
+    #[default]
+    Gaussian,
+    /// Of the action, `-ln N(u; m, std) + sum ln(1 - a^2)`, which is largest for actions that are spread evenly over the box. (The
+    /// published code of 2023 has the second term, too, but multiplies only the first by the number of actions.)
+    Squashed,
+}
 
 /// The policy prior `a = tanh(m + std noise)`. At first its standard deviation is e^-4, so that the planner explores, not the
 /// policy.
@@ -37,14 +51,21 @@ impl PolicyPrior {
 
     /// Actions drawn in latent states `[1, rows, latent]`: `[1, rows, actions]`.
     pub fn sample(&self, z: &Tensor3, rng: &mut Rng) -> Tensor3 {
-        self.sample_on(&mut NoneTape, z, &normals(z.shape().1 * self.actions, rng)).0
+        let noise = normals(z.shape().1 * self.actions, rng);
+        squashed(self.head.on(&mut NoneTape, z, Grad::Params), &noise)
     }
 
     /// Actions for standard normal `noise` (`[rows, actions]`) in latent states that are data, `[1, rows, actions]`, and the entropy
-    /// bonus of each (minus the log-density before the tanh), `[1, rows, 1]`. Differentiable in the policy's parameters.
-    pub fn sample_on<T: Tape<f32, Cpu>>(&self, tape: &mut T, z: &Tensor3, noise: &[f32]) -> (Tensor3, Tensor3) {
+    /// bonus of each, `[1, rows, 1]`. Differentiable in the policy's parameters.
+    pub fn sample_on<T: Tape<f32, Cpu>>(
+        &self,
+        tape: &mut T,
+        z: &Tensor3,
+        noise: &[f32],
+        entropy: EntropyBonus,
+    ) -> (Tensor3, Tensor3) {
         let head = self.head.on(tape, z, Grad::Params);
-        (tape.record(&head, |head| squashed(head, noise)), entropy_bonus(tape, &head, noise))
+        (tape.record(&head, |head| squashed(head, noise)), entropy_bonus(tape, &head, noise, entropy))
     }
 }
 
@@ -78,18 +99,24 @@ fn squashed<T: Tape<f32, Cpu>>(head: Tensor3<T>, noise: &[f32]) -> Tensor3<T> {
     })
 }
 
-/// The entropy bonus of actions with this noise, `[1, rows, 1]`: minus the log-density of `m + std noise` before the tanh, times
-/// the number of actions, as in the newest published code (without the tanh's correction, whose gradient cancels there). The code
-/// of 2023, which the paper's results are from, had the correction in its bonus.
-fn entropy_bonus<T: Tape<f32, Cpu>>(tape: &mut T, head: &Tensor3, noise: &[f32]) -> Tensor3 {
+/// The entropy bonus of actions with this noise, `[1, rows, 1]`: a sample of the entropy, times the number of actions.
+fn entropy_bonus<T: Tape<f32, Cpu>>(tape: &mut T, head: &Tensor3, noise: &[f32], entropy: EntropyBonus) -> Tensor3 {
     let actions = head.shape().2 / 2;
     let half_log_tau = 0.5 * std::f32::consts::TAU.ln();
     tape.rowwise(head, |row, head, slope| {
         let mut bonus = 0.0;
         for i in 0..actions {
-            let raw = head[actions + i];
-            bonus += 0.5 * noise[row * actions + i].powi(2) + log_std(raw) + half_log_tau;
+            let (raw, noise) = (head[actions + i], noise[row * actions + i]);
+            bonus += 0.5 * noise.powi(2) + log_std(raw) + half_log_tau;
             slope[actions + i] = actions as f32 * log_std_slope(raw);
+            if entropy == EntropyBonus::Squashed {
+                let deviation = log_std(raw).exp() * noise;
+                let u = head[i] + deviation;
+                // ln(1 - tanh(u)^2), also where the tanh is 1.
+                bonus += 2.0 * (std::f32::consts::LN_2 - u - softplus(-2.0 * u));
+                slope[i] = -2.0 * tanh(u) * actions as f32;
+                slope[actions + i] += slope[i] * deviation * log_std_slope(raw);
+            }
         }
         actions as f32 * bonus
     })
@@ -115,11 +142,52 @@ mod tests {
         let noise = [0.6, -1.1];
         near(values(&squashed(head.clone(), &noise)), &[0.478_261, -0.899_039]);
         let mut tape = OwnedTape::default();
-        let bonus = entropy_bonus(&mut tape, &head, &noise);
+        let bonus = entropy_bonus(&mut tape, &head, &noise, EntropyBonus::Gaussian);
         near(values(&bonus), &[2.245_754]);
         let mut gradients = ops::total(tape, &[(1.0, bonus)]).backward();
         let slope = gradients.get_or_alloc_mut(&head).expect("memory").to_vec();
         near(&slope, &[0.0, 0.0, 2.0 * log_std_slope(raw[0]), 2.0 * log_std_slope(raw[1])]);
+        // Twice minus the log-density with the tanh's correction.
+        near(values(&entropy_bonus(&mut NoneTape, &head, &noise, EntropyBonus::Squashed)), &[-2.0 * 0.788_510]);
+    }
+
+    #[test]
+    fn slopes_of_the_squashed_entropy_agree_with_differences() {
+        const NOISE: [f32; 4] = [0.6, -1.1, 0.3, 2.0];
+        let head = [0.3, -0.8, 0.5, 0.7, -0.2, 0.1, 0.6, 0.4];
+        let at = |tape: &mut OwnedTape<f32, Cpu>, head: [f32; 8]| {
+            let head = tensor(&device(), head.to_vec(), (1, 2, 4));
+            (entropy_bonus(tape, &head, &NOISE, EntropyBonus::Squashed), head)
+        };
+        let mut tape = OwnedTape::default();
+        let (bonus, x) = at(&mut tape, head);
+        let mut gradients = ops::total(tape, &[(2.0, bonus)]).backward();
+        for (i, slope) in gradients.get_or_alloc_mut(&x).expect("memory").iter().enumerate() {
+            let moved = |by: f32| {
+                let mut head = head;
+                head[i] += by;
+                values(&at(&mut OwnedTape::default(), head).0).iter().sum::<f32>()
+            };
+            let difference = (moved(1e-2) - moved(-1e-2)) / 2e-2;
+            assert!(
+                (slope - difference).abs() < 2e-2 * slope.abs().max(1.0),
+                "{i}: {slope}, {difference} by differences"
+            );
+        }
+    }
+
+    /// The entropy of an action has no maximum at the corners: there, both m and std are pulled back.
+    #[test]
+    fn the_squashed_entropy_pulls_saturated_actions_back() {
+        let head = tensor(&device(), vec![4.0, -4.0, 0.9, 0.9], (1, 1, 4));
+        let slopes = |entropy| {
+            let mut tape = OwnedTape::default();
+            let bonus = entropy_bonus(&mut tape, &head, &[0.1, -0.1], entropy);
+            ops::total(tape, &[(1.0, bonus)]).backward().get_or_alloc_mut(&head).expect("memory").to_vec()
+        };
+        let squashed = slopes(EntropyBonus::Squashed);
+        assert!(squashed[0] < -1.0 && squashed[1] > 1.0, "{squashed:?}");
+        assert_eq!(slopes(EntropyBonus::Gaussian)[..2], [0.0; 2]);
     }
 
     #[test]

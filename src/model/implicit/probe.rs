@@ -1,4 +1,4 @@
-//! A decoder for people: what the latent states of a decoder-free model know of the observation.
+//! A decoder for diagnostics: what the latent states of a decoder-free model know of the observation.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;

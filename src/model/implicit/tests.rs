@@ -61,7 +61,7 @@ fn frozen_returns(residual: bool) {
         let (actions, values_of) = if t < horizon {
             (column(t), model.rewards(&state, &column(t)))
         } else {
-            let actions = policy.sample_on(&mut NoneTape, &state, &noise).0;
+            let actions = policy.sample_on(&mut NoneTape, &state, &noise, EntropyBonus::Gaussian).0;
             let critics = model.critics().some(model.device(), &pair);
             let q = model.values(&critics, &state, &actions);
             (actions, (0..count).map(|i| 0.5 * (q[i] + q[count + i])).collect())
@@ -84,7 +84,7 @@ fn frozen_returns(residual: bool) {
     let noise = normals(count * horizon, &mut rng);
     let proposed = frozen.policy_sequences(values(&z), horizon, &noise);
     let first: Vec<f32> = noise.iter().step_by(horizon).copied().collect();
-    let expected = policy.sample_on(&mut NoneTape, &start, &first).0;
+    let expected = policy.sample_on(&mut NoneTape, &start, &first, EntropyBonus::Gaussian).0;
     for (found, expected) in proposed.iter().step_by(horizon).zip(values(&expected)) {
         assert!((found - expected).abs() < 1e-4, "{found}, expected {expected}");
     }

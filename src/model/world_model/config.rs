@@ -77,7 +77,7 @@ require fits(&[*units, rssm.features()]) => "`units` times the numbers of a late
 );
 
 impl WorldModelConfig {
-    /// Numbers in the widest layer.
+    /// Width of the widest layer.
     pub(crate) fn widest(&self) -> usize {
         self.units.max(self.bins).max(self.rssm.features()).max(3 * self.rssm.deter)
     }

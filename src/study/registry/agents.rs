@@ -42,7 +42,9 @@ impl AgentContext<'_> {
 
     fn scripted(&self) -> Result<Method> {
         let make = self.env.scripted.as_ref();
-        let make = make.ok_or_else(|| Error::Config(format!("{} has no scripted policy", self.env.name)))?;
+        let make = make.ok_or_else(|| {
+            Error::Config(format!("{} has no scripted policy; take another method, such as random", self.env.name))
+        })?;
         Ok(Method::fixed(make(self.options)?))
     }
 }

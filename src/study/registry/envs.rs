@@ -154,17 +154,17 @@ impl EnvEntry<Tabletop, TableOptions> {
     }
 }
 
-/// Fills in the defaults of the settings in a table that stands at a path.
+/// Fills in the defaults of the settings in the table at a path.
 pub(super) type Complete = fn(&str, Table) -> Result<Table, toml::de::Error>;
 
-/// The [`Complete`] of a type of settings. They are read from where they stand, so that errors tell the whole path.
+/// The [`Complete`] of a type of settings. They are read at their path, so that errors name all of it.
 pub(super) fn completed<S: Settings>(path: &str, table: Table) -> Result<Table, toml::de::Error> {
     let outer = Table::from_iter([(path.to_string(), Value::Table(table))]);
     let settings: BTreeMap<String, S> = outer.try_into()?;
     Ok(settings_table(&settings[path]))
 }
 
-/// Checks the settings in a table that stands at a path.
+/// Checks the settings in the table at a path.
 pub(super) type Check = fn(&str, &Table) -> Result<()>;
 
 /// The [`Check`] of settings that have ranges.

@@ -174,7 +174,10 @@ impl Registry {
         }
         let path = file.unwrap_or(Path::new(method));
         let mut config = RunConfig::from_table(table).map_err(|problem| bad_config(path, &problem))?;
-        self.complete(&mut config).map_err(|problem| bad_config(path, &problem))??;
+        self.complete(&mut config, path).map_err(|problem| match (problem, file) {
+            (Error::Config(problem), Some(file)) => Error::Config(format!("{}: {problem}", file.display())),
+            (problem, _) => problem,
+        })?;
         Ok(config)
     }
 
@@ -214,20 +217,19 @@ impl Registry {
         }
     }
 
-    /// Fills in the defaults of environment and agent.
-    fn complete(&self, config: &mut RunConfig) -> Result<Result<()>, toml::de::Error> {
-        let (env, agent) = match (self.env_entry(&config.task), self.agent_entry(&config.agent)) {
-            (Ok(env), Ok(agent)) => (env, agent),
-            (Err(problem), _) | (_, Err(problem)) => return Ok(Err(problem)),
-        };
-        config.env = (env.complete)("env", std::mem::take(&mut config.env))?;
-        config.settings = (agent.complete)(&config.agent, std::mem::take(&mut config.settings))?;
+    /// Fills in the defaults of environment and agent, in a configuration from `path`.
+    fn complete(&self, config: &mut RunConfig, path: &Path) -> Result<()> {
+        let (env, agent) = (self.env_entry(&config.task)?, self.agent_entry(&config.agent)?);
+        let wrong = |problem: toml::de::Error| bad_config(path, &problem);
+        config.env = (env.complete)("env", std::mem::take(&mut config.env)).map_err(wrong)?;
+        config.settings = (agent.complete)(&config.agent, std::mem::take(&mut config.settings)).map_err(wrong)?;
         if !agent.learns && config.steps > 0 {
             let problem = format!("`steps` is {}, but {} does not learn; leave it out", config.steps, config.method);
-            return Ok(Err(Error::Config(problem)));
+            return Err(Error::Config(problem));
         }
-        let in_range = || (env.check)("env", &config.env).and_then(|()| (agent.check)(&config.agent, &config.settings));
-        Ok(config.check().and_then(|()| in_range()))
+        config.check()?;
+        (env.check)("env", &config.env)?;
+        (agent.check)(&config.agent, &config.settings)
     }
 
     /// The environment of a run.
@@ -260,10 +262,10 @@ impl Registry {
 
     /// The configuration as the run in `folder` was begun with it: without the settings that did not exist at the time, if it has
     /// their defaults now.
-    fn as_begun(&self, config: &RunConfig, folder: &Path) -> RunConfig {
+    pub(crate) fn as_begun(&self, config: &RunConfig, folder: &Path) -> RunConfig {
         let same = |begun: &RunConfig| {
             let mut begun = begun.clone();
-            matches!(self.complete(&mut begun), Ok(Ok(()))) && begun == *config
+            self.complete(&mut begun, folder).is_ok() && begun == *config
         };
         read_config(folder).ok().map(|(_, begun)| begun).filter(same).unwrap_or_else(|| config.clone())
     }
@@ -285,15 +287,16 @@ impl Registry {
     pub fn trained_method_with(&self, folder: &Path, file: Option<&Path>) -> Result<(RunConfig, Method)> {
         let (path, as_read) = read_config(folder)?;
         let mut config = as_read.clone();
-        self.complete(&mut config).map_err(|problem| bad_config(&path, &problem))??;
+        self.complete(&mut config, &path)?;
         if let Some(file) = file {
             let mut table = config.to_table();
             self.change(&mut table, file, &config.task, &self.choices(&config.task)?)?;
             config = RunConfig::from_table(table).map_err(|problem| bad_config(file, &problem))?;
-            self.complete(&mut config).map_err(|problem| bad_config(file, &problem))??;
+            self.complete(&mut config, file)?;
         }
         let mut method = self.method(&config)?;
-        if config.learns() {
+        // Not `config.learns()`: a file may say that it has no steps.
+        if self.agent_entry(&config.agent)?.learns {
             load_weights(folder, &as_read, &mut method)?;
         }
         Ok((config, method))

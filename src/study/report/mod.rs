@@ -12,7 +12,7 @@ use super::replays;
 use super::starts::Starts;
 use super::tables::Tables;
 use super::verdict::{TOLD_THE_REWARD, verdict};
-use crate::error::Result;
+use crate::error::{Result, shortened};
 use crate::files;
 
 /// A temporary file that is older than this is nobody's any more.
@@ -22,9 +22,23 @@ const ABANDONED: Duration = Duration::from_secs(3600);
 /// page that needs no other file, `report.html`, into the folder `to`. Returns the table of results as text.
 ///
 /// # Errors
-/// If a table is missing or damaged, or if a file cannot be written.
+/// If a table is missing or damaged, if `to` holds the tables of another study, or if a file cannot be written.
 pub fn write(from: &Path, to: &Path) -> Result<String> {
+    write_noting(from, to, &mut |_| ())
+}
+
+/// The same. Each run and each recording that the report is without is told to `note`, with the reason.
+///
+/// # Errors
+/// As [`write()`].
+pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String)) -> Result<String> {
     let tables = Tables::read(from)?;
+    if !same_folder(from, to) {
+        tables.check_place(to)?;
+    }
+    for (run, reason) in tables.missing_runs()? {
+        note(format!("left out: {} ({})", shortened(&run, 200), shortened(&reason, 300)));
+    }
     files::sweep(to, ABANDONED);
     tables.write_summary(to)?;
     let pairs = tables.tasks_and_methods()?;
@@ -42,8 +56,10 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     }
     text += &format!("## What is compared\n\n{}\n", terms(&pairs));
     text += &format!("## Results\n\n{}", results::section(&tables)?);
-    let replays = replays::read(from)?;
-    replays::copy(&replays, from, to)?;
+    let (replays, problems) = replays::of_report(&tables, from, to)?;
+    for problem in problems {
+        note(format!("no replay: {problem}"));
+    }
     let mut not_alike = Vec::new();
     for name in &tasks {
         let differ = task::grids_differ(&tables, name)?;
@@ -63,13 +79,21 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
     Ok(tuning_note(&tables)?.to_string() + &results::text_table(&tables)?)
 }
 
-/// Joins the tables and recordings of several studies ([`Tables::read_all`]) into a study in the folder `to`.
+/// Joins the tables and recordings of several studies ([`Tables::read_all`]) into a study in the folder `to`. Returns what is wrong with
+/// recordings that cannot be used.
 ///
 /// # Errors
-/// If the studies cannot be joined, or if a file cannot be read or written.
-pub fn join(folders: &[PathBuf], to: &Path) -> Result<()> {
-    Tables::read_all(folders)?.write(to)?;
+/// If the studies cannot be joined, if `to` holds the tables of another study, or if a file cannot be read or written.
+pub fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
+    let tables = Tables::read_all(folders)?;
+    tables.check_place(to)?;
+    tables.write(to)?;
     replays::join(folders, to)
+}
+
+/// Whether two paths name one folder that exists.
+pub(crate) fn same_folder(a: &Path, b: &Path) -> bool {
+    a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
 /// What stands above the numbers of runs that served to choose settings.

@@ -9,7 +9,7 @@ use crate::study::folder::difference;
 pub(super) struct Admission {
     admitted: BTreeSet<(String, String, u64, String)>,
     /// Of each method on a task the seed and the settings of its first run.
-    first: BTreeMap<(String, String), (u64, toml::Table)>,
+    first: BTreeMap<(String, String), (u64, Option<toml::Table>)>,
 }
 
 /// A run that would like to be in a study.
@@ -19,8 +19,8 @@ pub(super) struct Candidate {
     pub seed: u64,
     /// Empty if the tables do not tell.
     pub starts: String,
-    /// Its configuration.
-    pub settings: toml::Table,
+    /// Its configuration, if that is recorded.
+    pub settings: Option<toml::Table>,
 }
 
 impl Admission {
@@ -29,9 +29,18 @@ impl Admission {
         if self.admitted.contains(&run.key()) {
             return Some("is there twice".into());
         }
-        let (seed, settings) = self.first.get(&run.of_method())?;
-        let how = difference(&run.common_settings(), settings)?;
-        Some(format!("has another configuration than with seed {seed} ({how})"))
+        let (seed, first) = self.first.get(&run.of_method())?;
+        match (run.common_settings(), first) {
+            (Some(settings), Some(first)) => {
+                let how = difference(&settings, first)?;
+                Some(format!("has another configuration than with seed {seed} ({how})"))
+            }
+            (None, None) => None,
+            (None, Some(_)) => Some(format!("cannot be compared with seed {seed}: its configuration is not recorded")),
+            (Some(_), None) => {
+                Some(format!("cannot be compared with seed {seed}: the configuration of that is not recorded"))
+            }
+        }
     }
 
     /// Admits a run.
@@ -42,6 +51,11 @@ impl Admission {
 }
 
 impl Candidate {
+    /// A whole number of its configuration.
+    pub fn number(&self, key: &str) -> Option<i64> {
+        self.settings.as_ref()?.get(key)?.as_integer()
+    }
+
     fn key(&self) -> (String, String, u64, String) {
         (self.task.clone(), self.method.clone(), self.seed, self.starts.clone())
     }
@@ -51,11 +65,11 @@ impl Candidate {
     }
 
     /// The settings without those in which the runs of a method differ.
-    fn common_settings(&self) -> toml::Table {
-        let mut settings = self.settings.clone();
+    fn common_settings(&self) -> Option<toml::Table> {
+        let mut settings = self.settings.clone()?;
         for own in ["seed", "starts"] {
             settings.remove(own);
         }
-        settings
+        Some(settings)
     }
 }

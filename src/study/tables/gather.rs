@@ -33,8 +33,16 @@ impl Tables {
         }
         let Collected { evaluations, models, values, tests, runs, .. } = collected;
         let joined = |rows: Vec<LazyFrame>| concatenate(rows).map_err(inside);
-        let results = [joined(evaluations)?, joined(models)?, joined(values)?, joined(tests)?];
-        Self::summarised(results, joined(runs)?, left_out(missing).map_err(inside)?)
+        let tables = Self {
+            evaluations: joined(evaluations)?,
+            models: joined(models)?,
+            values: joined(values)?,
+            tests: joined(tests)?,
+            runs: joined(runs)?,
+            left_out: left_out(missing).map_err(inside)?,
+            summary: DataFrame::empty(),
+        };
+        tables.summarised()
     }
 }
 
@@ -61,7 +69,7 @@ impl Collected {
             method: config.method.clone(),
             seed: config.seed,
             starts: config.starts.name().into(),
-            settings: config.to_table(),
+            settings: Some(config.to_table()),
         };
         if let Some(objection) = self.admission.objection(&run) {
             let problem = format!("`{}` on `{}` with seed {} {objection}", run.method, run.task, run.seed);

@@ -1,39 +1,36 @@
 //! Joins the tables of several studies into those of one.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use polars::prelude::*;
 
 use super::admission::{Admission, Candidate};
-use super::gather::concatenate;
-use super::{Tables, inside, numbers, strings};
+use super::gather::{concatenate, left_out};
+use super::runs::{RunName, run_names, said_of, settings};
+use super::{Tables, inside};
 use crate::error::{Error, Result};
-
-/// Task, method and seed.
-type RunName = (String, String, u64);
 
 impl Tables {
     /// Reads the tables of several studies as those of one, for runs that were made at different times or on different machines.
     /// Methods come in the order of their first runs, and the runs of a method in that of their seeds. A run that is there twice, or
-    /// that has other settings than the first with its task and method, is left out by name, as in [`Tables::gather`].
+    /// that has other settings than the first with its task and method, is left out by name, as in [`Tables::gather`]. Where the
+    /// settings of some are recorded and those of others are not, the latter are recorded as nothing.
     ///
     /// # Errors
     /// As [`Tables::read`], for each of them and for all together; or if one lacks a column that another has.
     pub fn read_all(folders: &[PathBuf]) -> Result<Self> {
         let (mut studies, mut taken) = (Vec::new(), Vec::new());
-        let (mut left_out, mut methods) = (Vec::new(), Vec::new());
+        let (mut missing, mut methods) = (Vec::new(), Vec::new());
         let mut admission = Admission::default();
         for (at, folder) in folders.iter().enumerate() {
             let tables = Self::read(folder)?;
-            let mut settings = settings(&tables)?;
+            let mut settings = settings(&tables.runs()?)?;
             for name in run_names(&tables.tests).map_err(inside)? {
                 let (task, method, seed) = name.clone();
-                let settings = settings.remove(&name).unwrap_or_default();
+                let settings = settings.remove(&name);
                 let run = Candidate { task, method, seed, starts: String::new(), settings };
                 if let Some(objection) = admission.objection(&run) {
-                    let run = format!("{}: {} on {} with seed {}", folder.display(), name.1, name.0, name.2);
-                    left_out.push((run, format!("it {objection}")));
+                    missing.push((said_of(folder, &name), format!("it {objection}")));
                     continue;
                 }
                 admission.admit(&run);
@@ -43,9 +40,11 @@ impl Tables {
                 }
                 taken.push((at, name));
             }
-            left_out.extend(tables.missing_runs()?);
+            missing.extend(tables.missing_runs()?);
             studies.push(tables);
         }
+        same_starts(&studies, folders)?;
+        name_unrecorded_runs(&mut studies)?;
         let place = |(task, method, seed): &RunName| {
             (methods.iter().position(|(of, name)| (of, name) == (task, method)), *seed)
         };
@@ -55,12 +54,59 @@ impl Tables {
             let rows = taken.iter().filter_map(|(at, name)| of_run(table(&studies[*at]), name));
             concatenate(rows.collect()).map_err(inside)
         };
-        Self::summarised(
-            [joined(|t| &t.evaluations)?, joined(|t| &t.models)?, joined(|t| &t.values)?, joined(|t| &t.tests)?],
-            joined(|t| &t.runs)?,
-            super::gather::left_out(left_out).map_err(inside)?,
-        )
+        let tables = Self {
+            evaluations: joined(|t| &t.evaluations)?,
+            models: joined(|t| &t.models)?,
+            values: joined(|t| &t.values)?,
+            tests: joined(|t| &t.tests)?,
+            runs: joined(|t| &t.runs)?,
+            left_out: left_out(missing).map_err(inside)?,
+            summary: DataFrame::empty(),
+        };
+        tables.summarised()
     }
+}
+
+/// # Errors
+/// If some studies were tested on the test's and others on development starts.
+fn same_starts(studies: &[Tables], folders: &[PathBuf]) -> Result<()> {
+    let mut first = None;
+    for (tables, folder) in studies.iter().zip(folders) {
+        let starts = tables.starts()?;
+        let (before, other) = *first.get_or_insert((starts, folder));
+        if starts != before {
+            return Err(Error::Config(format!(
+                "the runs in {} were tested on the starts `{}`, those in {} on `{}`; compare them separately",
+                other.display(),
+                before.name(),
+                folder.display(),
+                starts.name()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// If some studies have a table of their runs, those of earlier versions get one that names theirs.
+fn name_unrecorded_runs(studies: &mut [Tables]) -> Result<()> {
+    if studies.iter().all(|tables| tables.runs.width() == 0) {
+        return Ok(());
+    }
+    for tables in studies.iter_mut().filter(|tables| tables.runs.width() == 0) {
+        let names = run_names(&tables.tests).map_err(inside)?;
+        let column = |name: &str, of: fn(&RunName) -> &str| {
+            Column::new(name.into(), names.iter().map(of).collect::<Vec<&str>>())
+        };
+        let columns = vec![
+            column("task", |(task, ..)| task),
+            column("method", |(_, method, _)| method),
+            Column::new("seed".into(), names.iter().map(|(.., seed)| *seed as i64).collect::<Vec<i64>>()),
+            column("version", |_| ""),
+            column("configuration", |_| ""),
+        ];
+        tables.runs = DataFrame::new_infer_height(columns).map_err(inside)?;
+    }
+    Ok(())
 }
 
 /// A table with fewer columns comes from an earlier version.
@@ -75,28 +121,6 @@ fn same_columns<'a>(tables: impl Iterator<Item = (&'a DataFrame, &'a PathBuf)>) 
         ))),
         None => Ok(()),
     }
-}
-
-/// The names of the runs in a table, in the order of their first rows.
-fn run_names(table: &DataFrame) -> PolarsResult<Vec<RunName>> {
-    let seeds = numbers(table, "seed")?.into_iter().map(|seed| seed.unwrap_or_default() as u64);
-    let names = strings(table, "task")?.into_iter().zip(strings(table, "method")?).zip(seeds);
-    let mut seen = BTreeSet::new();
-    let names = names.map(|((task, method), seed)| (task, method, seed));
-    Ok(names.filter(|name| seen.insert(name.clone())).collect())
-}
-
-/// The configuration of each recorded run.
-fn settings(tables: &Tables) -> Result<BTreeMap<RunName, toml::Table>> {
-    let mut settings = BTreeMap::new();
-    for run in tables.runs()? {
-        let table: toml::Table = run.configuration.parse().map_err(|problem: toml::de::Error| {
-            let problem = problem.message();
-            Error::Config(format!("`{}` on `{}`: its configuration is not TOML: {problem}", run.method, run.task))
-        })?;
-        settings.insert((run.task, run.method, run.seed), table);
-    }
-    Ok(settings)
 }
 
 /// The rows of a run; `None` if the table has none at all.

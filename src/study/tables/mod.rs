@@ -12,6 +12,7 @@ mod gather;
 mod join;
 mod read;
 mod runs;
+mod whole;
 
 use super::starts::Starts;
 use super::summary::summarise;
@@ -19,7 +20,7 @@ use crate::chart::LARGEST;
 use crate::error::{Error, Result};
 use crate::files;
 pub use runs::Run;
-use runs::check_runs;
+use runs::{check_runs, run_names};
 
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
@@ -39,52 +40,69 @@ pub struct Tables {
     /// task, method, seed, step, horizon, rmse, ...: the open-loop prediction error of each learned model on
     /// the episodes of each evaluation.
     pub models: DataFrame,
-    /// task, method, seed, step, expected, realised, ...: the estimated value in each
-    /// evaluation, and the discounted return that followed.
+    /// task, method, seed, step, expected, realised, ...: the return that the agent expected in each
+    /// evaluation (its value, or its plans' predicted return over their horizon), and the return that followed.
     pub values: DataFrame,
     /// task, method, seed, episode, return, success, ..., starts: one row per test episode.
     pub tests: DataFrame,
     /// task, method, seed, version, configuration: one row per run, with the version of the program that made it, and its
     /// configuration as TOML. Studies of earlier versions do not have this table.
     pub runs: DataFrame,
-    /// run, reason: the folders of runs that are in no table, and why.
+    /// run, reason: the runs, or their folders, that are in no table, and why.
     pub left_out: DataFrame,
     /// One row per task and method, computed from the other tables.
     pub summary: DataFrame,
 }
 
 impl Tables {
-    /// Reads the tables of a study from its folder.
+    /// Reads the tables of a study from its folder. A run that has fewer rows than its configuration says, or another configuration
+    /// than the first with its task and method, is left out by name, as in [`Tables::gather`]; the runs of earlier versions, which
+    /// recorded no configuration, cannot be checked.
     ///
     /// # Errors
-    /// If one is missing or damaged, or the starts of the tests differ.
+    /// If a table is missing or damaged, or lacks a run; if there is no whole run; or if the starts of the tests differ.
     pub fn read(folder: &Path) -> Result<Self> {
         let optional = |file: &str, read: &dyn Fn(&Path) -> Result<DataFrame>| {
             let path = folder.join(file);
             if path.exists() { read(&path) } else { Ok(DataFrame::empty()) }
         };
-        Self::summarised(
-            [
-                read::of_study(&folder.join("evaluations.csv"), &read::EVALUATIONS)?,
-                read::of_study(&folder.join("models.csv"), &read::MODELS)?,
-                read::of_study(&folder.join("values.csv"), &read::VALUES)?,
-                read::of_study(&folder.join("tests.csv"), &read::TESTS)?,
-            ],
-            optional("runs.csv", &|path| read::of_study(path, &read::RUNS))?,
-            optional("left_out.csv", &|path| read::of_run(path, &read::LEFT_OUT))?,
-        )
+        let mut tables = Self {
+            evaluations: read::of_study(&folder.join("evaluations.csv"), &read::EVALUATIONS)?,
+            models: read::of_study(&folder.join("models.csv"), &read::MODELS)?,
+            values: read::of_study(&folder.join("values.csv"), &read::VALUES)?,
+            tests: read::of_study(&folder.join("tests.csv"), &read::TESTS)?,
+            runs: optional("runs.csv", &|path| read::of_study(path, &read::RUNS))?,
+            left_out: optional("left_out.csv", &|path| read::of_run(path, &read::LEFT_OUT))?,
+            summary: DataFrame::empty(),
+        };
+        tables.leave_out_partial_runs(folder)?;
+        tables.summarised()
     }
 
-    fn summarised(
-        [evaluations, models, values, tests]: [DataFrame; 4],
-        runs: DataFrame,
-        left_out: DataFrame,
-    ) -> Result<Self> {
-        check_runs(&evaluations, [&models, &values, &runs], &tests)?;
-        let summary = summarise(&evaluations, &values, &tests).map_err(inside)?;
-        let tables = Self { evaluations, models, values, tests, runs, left_out, summary };
-        tables.starts()?;
-        Ok(tables)
+    /// Computes the summary from the other tables.
+    fn summarised(mut self) -> Result<Self> {
+        check_runs(&self)?;
+        self.summary = summarise(&self.evaluations, &self.values, &self.tests).map_err(inside)?;
+        self.starts()?;
+        Ok(self)
+    }
+
+    /// # Errors
+    /// If the folder holds the tables of a study with a run that these do not have: nothing could restore them.
+    pub(super) fn check_place(&self, folder: &Path) -> Result<()> {
+        let path = folder.join("tests.csv");
+        if !path.exists() {
+            return Ok(());
+        }
+        let ours = run_names(&self.tests).map_err(inside)?;
+        let theirs = run_names(&read::of_study(&path, &read::TESTS)?).map_err(inside)?;
+        match theirs.iter().find(|run| !ours.contains(run)) {
+            None => Ok(()),
+            Some((task, method, seed)) => Err(Error::Config(format!(
+                "{}: this folder holds the tables of another study (with `{method}` on `{task}`, seed {seed}); choose another --out",
+                folder.display()
+            ))),
+        }
     }
 
     /// On which starts the runs were tested. Tables of earlier versions do not say: they know only the test's.
@@ -165,6 +183,20 @@ impl Tables {
     /// If the table lacks a column.
     pub fn successes(&self, task: &str, method: &str) -> Result<Vec<Vec<f64>>> {
         let found = || lists(&by_run(of(&self.tests, task, method)?.lazy(), &["success"])?, "success");
+        found().map_err(inside)
+    }
+
+    /// The return of an episode of a run's test, counted from 1; `None` if it is not in the tests.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub(super) fn test_return(&self, task: &str, method: &str, seed: u64, episode: usize) -> Result<Option<f64>> {
+        let number = |name: &str, number: u64| col(name).eq(lit(number as i64));
+        let found = || {
+            let rows = of(&self.tests, task, method)?.lazy();
+            let rows = rows.filter(number("seed", seed).and(number("episode", episode as u64))).collect()?;
+            Ok(numbers(&rows, "return")?.into_iter().next().flatten())
+        };
         found().map_err(inside)
     }
 

@@ -240,7 +240,7 @@ impl Cells {
         }
     }
 
-    /// Takes in a cell, or answers with the rule that it breaks.
+    /// Takes in a cell, or returns the rule that it breaks.
     fn push(&mut self, text: &str) -> Result<(), String> {
         match self {
             Self::Text(Cell::Starts, names) => {

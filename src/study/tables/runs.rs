@@ -1,11 +1,16 @@
 //! Which runs the tables of a study are made of.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use polars::prelude::*;
 
 use super::{Tables, inside, numbers, strings};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, shortened};
+use crate::study::config::upgrade_keys;
+
+/// Task, method and seed.
+pub(super) type RunName = (String, String, u64);
 
 /// A run of a study.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,7 +23,7 @@ pub struct Run {
     pub seed: u64,
     /// The version of the program that made it; empty if that is not known.
     pub version: String,
-    /// Its configuration, as TOML.
+    /// Its configuration, as TOML; empty if that is not known.
     pub configuration: String,
 }
 
@@ -40,7 +45,7 @@ impl Tables {
         Ok(names.zip(texts).map(run).collect())
     }
 
-    /// The folders of runs that are in no table, each with the reason.
+    /// The runs, or their folders, that are in no table, each with the reason.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -58,47 +63,82 @@ impl Tables {
     /// If the table lacks a column.
     pub fn seeds_of_learners(&self) -> Result<BTreeMap<(String, String), BTreeSet<u64>>> {
         let mut seeds: BTreeMap<_, BTreeSet<u64>> = BTreeMap::new();
-        for (task, method, seed) in runs(&self.evaluations).map_err(inside)? {
-            seeds.entry((task, method)).or_default().extend(seed.parse::<u64>());
+        for (task, method, seed) in run_names(&self.evaluations).map_err(inside)? {
+            seeds.entry((task, method)).or_default().insert(seed);
         }
         Ok(seeds)
     }
 }
 
 /// Every run was tested, and of a method that learns every run was evaluated.
-pub(super) fn check_runs(evaluations: &DataFrame, others: [&DataFrame; 3], tests: &DataFrame) -> Result<()> {
-    let [evaluated, tested] = [evaluations, tests].map(|table| runs(table).map_err(inside));
-    let (evaluated, tested) = (evaluated?, tested?);
+pub(super) fn check_runs(tables: &Tables) -> Result<()> {
+    let names = |table: &DataFrame| -> Result<BTreeSet<RunName>> {
+        Ok(run_names(table).map_err(inside)?.into_iter().collect())
+    };
+    let (evaluated, tested) = (names(&tables.evaluations)?, names(&tables.tests)?);
     if tested.is_empty() {
         return Err(Error::Config("the study has no test episode: there is nothing to report".into()));
     }
-    let missing = |run: &(String, String, String), table: &str| {
-        let (task, method, seed) = run;
-        Err(Error::Config(format!(
-            "the study is incomplete: `{method}` on `{task}` with seed {seed} is not in its {table}"
-        )))
-    };
-    for table in others.into_iter().chain([evaluations]) {
-        if let Some(run) = runs(table).map_err(inside)?.difference(&tested).next() {
-            return missing(run, "tests");
+    for table in [&tables.models, &tables.values, &tables.runs, &tables.evaluations] {
+        if let Some(run) = names(table)?.difference(&tested).next() {
+            return Err(incomplete(run, "tests.csv"));
         }
     }
-    let learns = |(task, method, _): &&(String, String, String)| {
-        evaluated.iter().any(|(of, other, _)| (of, other) == (task, method))
-    };
+    let learns = |(task, method, _): &&RunName| evaluated.iter().any(|(of, other, _)| (of, other) == (task, method));
     match tested.difference(&evaluated).find(learns) {
-        Some(run) => missing(run, "evaluations"),
+        Some(run) => Err(incomplete(run, "evaluations.csv")),
         None => Ok(()),
     }
 }
 
-/// Task, method and seed of each run in a table.
-fn runs(table: &DataFrame) -> PolarsResult<BTreeSet<(String, String, String)>> {
+/// For a run that is not in a table which has to have it.
+pub(super) fn incomplete((task, method, seed): &RunName, file: &str) -> Error {
+    Error::Config(format!(
+        "the study is incomplete: `{method}` on `{task}` with seed {seed} is not in its {file}; \
+         restore that table, or make those of the study anew"
+    ))
+}
+
+/// A run in the table of those that are left out.
+pub(super) fn said_of(folder: &Path, (task, method, seed): &RunName) -> String {
+    format!("{}: {method} on {task} with seed {seed}", folder.display())
+}
+
+/// The run of each row.
+pub(super) fn row_names(table: &DataFrame) -> PolarsResult<Vec<RunName>> {
     if table.width() == 0 {
-        return Ok(BTreeSet::new());
+        return Ok(Vec::new());
     }
-    let seeds = table.column("seed")?.cast(&DataType::String)?;
-    let seeds = seeds.str()?.iter().map(|seed| seed.unwrap_or_default().to_string());
-    let names = strings(table, "task")?.into_iter().zip(strings(table, "method")?);
-    Ok(names.zip(seeds).map(|((task, method), seed)| (task, method, seed)).collect())
+    let seeds = numbers(table, "seed")?.into_iter().map(|seed| seed.unwrap_or_default() as u64);
+    let names = strings(table, "task")?.into_iter().zip(strings(table, "method")?).zip(seeds);
+    Ok(names.map(|((task, method), seed)| (task, method, seed)).collect())
+}
+
+/// The runs in a table, in the order of their first rows.
+pub(super) fn run_names(table: &DataFrame) -> PolarsResult<Vec<RunName>> {
+    let mut seen = BTreeSet::new();
+    let mut names = row_names(table)?;
+    names.retain(|name| seen.insert(name.clone()));
+    Ok(names)
+}
+
+/// The configuration of each run for which it is recorded.
+///
+/// # Errors
+/// If one is not TOML.
+pub(super) fn settings(runs: &[Run]) -> Result<BTreeMap<RunName, toml::Table>> {
+    let mut settings = BTreeMap::new();
+    for run in runs.iter().filter(|run| !run.configuration.is_empty()) {
+        let Run { task, method, seed, configuration, .. } = run;
+        let mut table: toml::Table = configuration.parse().map_err(|problem: toml::de::Error| {
+            let problem = shortened(problem.message().trim_end(), 200);
+            let run = format!("`{method}` on `{task}` with seed {seed}");
+            Error::Config(format!("{run}: its configuration in runs.csv is not TOML ({problem}); restore that table"))
+        })?;
+        // As when a run's folder is read: the number of values is no setting.
+        table.remove("values");
+        upgrade_keys(&mut table);
+        settings.insert((task.clone(), method.clone(), *seed), table);
+    }
+    Ok(settings)
 }

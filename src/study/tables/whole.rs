@@ -1,0 +1,95 @@
+//! Whether the tables of a study have all rows of each of its runs, by the configurations in `runs.csv`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use polars::prelude::*;
+
+use super::admission::{Admission, Candidate};
+use super::gather::left_out;
+use super::runs::{RunName, incomplete, row_names, run_names, said_of, settings};
+use super::{Tables, inside, numbers};
+use crate::error::{Error, Result};
+
+impl Tables {
+    /// Leaves out the runs of which rows were lost, or that have another configuration than the first with their task and method.
+    ///
+    /// # Errors
+    /// If there is nothing but such runs, or a run is not in a table at all.
+    pub(super) fn leave_out_partial_runs(&mut self, folder: &Path) -> Result<()> {
+        let objections = self.objections().map_err(Error::data(folder))?;
+        let Some((first, reason)) = objections.first() else { return Ok(()) };
+        let (task, method, seed) = first;
+        let problem = format!("no run can be reported; `{method}` on `{task}` with seed {seed}: {reason}");
+        let mut missing = self.missing_runs()?;
+        missing.extend(objections.iter().map(|(run, reason)| (said_of(folder, run), reason.clone())));
+        let out: BTreeSet<&RunName> = objections.iter().map(|(run, _)| run).collect();
+        let Self { evaluations, models, values, tests, runs, .. } = self;
+        for table in [evaluations, models, values, tests, runs] {
+            *table = without(table, &out).map_err(inside)?;
+        }
+        if self.tests.height() == 0 {
+            return Err(Error::data(folder)(problem));
+        }
+        self.left_out = left_out(missing).map_err(inside)?;
+        Ok(())
+    }
+
+    /// The runs to leave out, each with the reason.
+    fn objections(&self) -> Result<Vec<(RunName, String)>> {
+        let recorded = self.runs()?;
+        if recorded.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut settings = settings(&recorded)?;
+        let names = run_names(&self.runs).map_err(inside)?;
+        let names: BTreeSet<RunName> = names.into_iter().collect();
+        let steps = last_of_each(&self.evaluations, "step").map_err(inside)?;
+        let episodes = last_of_each(&self.tests, "episode").map_err(inside)?;
+        let (mut admission, mut objections) = (Admission::default(), Vec::new());
+        for name in run_names(&self.tests).map_err(inside)? {
+            if !names.contains(&name) {
+                return Err(incomplete(&name, "runs.csv"));
+            }
+            let (task, method, seed) = name.clone();
+            let run = Candidate { task, method, seed, starts: String::new(), settings: settings.remove(&name) };
+            if run.number("steps").is_some_and(|steps| steps > 0) && !steps.contains_key(&name) {
+                return Err(incomplete(&name, "evaluations.csv"));
+            }
+            let lost = lost_rows(&run, steps.get(&name).copied(), episodes.get(&name).copied());
+            match lost.or_else(|| admission.objection(&run).map(|objection| format!("it {objection}"))) {
+                Some(reason) => objections.push((name, reason)),
+                None => admission.admit(&run),
+            }
+        }
+        Ok(objections)
+    }
+}
+
+/// What the tables lack of a run, of which they have an evaluation at `step` as the last, and `episodes` of the test.
+fn lost_rows(run: &Candidate, step: Option<i64>, episodes: Option<i64>) -> Option<String> {
+    let differs = |wanted: Option<i64>, there: Option<i64>| wanted.zip(there).filter(|(wanted, there)| wanted != there);
+    if let Some((steps, step)) = differs(run.number("steps").filter(|steps| *steps > 0), step) {
+        return Some(format!("its last evaluation in `evaluations.csv` is at step {step} of {steps}"));
+    }
+    let (wanted, there) = differs(run.number("test_episodes"), episodes)?;
+    Some(format!("its test in `tests.csv` has {there} of {wanted} episodes"))
+}
+
+/// A column's number in the last row of each run.
+fn last_of_each(table: &DataFrame, column: &str) -> PolarsResult<BTreeMap<RunName, i64>> {
+    if table.width() == 0 {
+        return Ok(BTreeMap::new());
+    }
+    let numbers = numbers(table, column)?.into_iter().map(|number| number.unwrap_or_default() as i64);
+    Ok(row_names(table)?.into_iter().zip(numbers).collect())
+}
+
+/// The rows of the other runs.
+fn without(table: &DataFrame, runs: &BTreeSet<&RunName>) -> PolarsResult<DataFrame> {
+    if table.width() == 0 {
+        return Ok(table.clone());
+    }
+    let kept: BooleanChunked = row_names(table)?.iter().map(|name| Some(!runs.contains(name))).collect();
+    table.filter(&kept)
+}
