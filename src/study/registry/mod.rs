@@ -69,7 +69,7 @@ impl Registry {
         agents::register(envs::register(registry)).quick_study(
             &["reach"],
             // The longest runs first, so that no core waits for the last one.
-            &["dreamer", "pets", "tdmpc2", "oracle", "sac", "scripted", "random"],
+            &["dreamer", "oracle", "pets", "tdmpc2", "sac", "scripted", "random"],
             Some(Budget { steps: 2_000, evaluate_every: 500 }),
         )
     }
