@@ -381,7 +381,7 @@ fn a_model_that_diverged_is_reported() {
         }
         let text = study.report().expect("a report");
         // One of its model, two of the returns that it expected and got.
-        let note = "not finite: 3 of the numbers about `pets`";
+        let note = "not finite: 3 of the numbers about `dreamer`";
         assert_eq!(text.contains(note), !number.is_empty(), "`{number}`: {text}");
         assert!(!text.contains("NaN") && !text.contains("inf "), "{text}");
     }
@@ -409,8 +409,8 @@ fn rows_that_are_doubled_missing_or_moved_are_named() {
     type Change = fn(&mut Vec<String>);
     let changes: [(usize, Change, &str); 11] = [
         (0, |lines| lines.insert(2, lines[1].clone()), "line 3: step 0 of a run comes after step 0"),
-        (0, |lines| lines.swap(1, 2), "line 3: step 0 of a run comes after step 250"),
-        (1, |lines| lines.swap(1, 2), "line 3: step 250, horizon 1 of a run comes after step 250, horizon 2"),
+        (0, |lines| lines.swap(1, 2), "line 3: step 0 of a run comes after step 500"),
+        (1, |lines| lines.swap(1, 2), "line 3: step 500, horizon 1 of a run comes after step 500, horizon 2"),
         (3, |lines| drop(lines.remove(1)), "line 2: episode 2 of a run comes after nothing"),
         (3, |lines| drop(lines.remove(3)), "line 4: episode 4 of a run comes after episode 2"),
         (3, |lines| lines.retain(|line| !line.contains(",sac,")), "`sac` on `reach` with seed 0 is not in its tests"),
