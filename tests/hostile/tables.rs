@@ -410,7 +410,7 @@ fn rows_that_are_doubled_missing_or_moved_are_named() {
     let changes: [(usize, Change, &str); 11] = [
         (0, |lines| lines.insert(2, lines[1].clone()), "line 3: step 0 of a run comes after step 0"),
         (0, |lines| lines.swap(1, 2), "line 3: step 0 of a run comes after step 500"),
-        (1, |lines| lines.swap(1, 2), "line 3: step 500, horizon 1 of a run comes after step 500, horizon 2"),
+        (1, |lines| lines.swap(1, 2), "line 3: step 0, horizon 1 of a run comes after step 0, horizon 2"),
         (3, |lines| drop(lines.remove(1)), "line 2: episode 2 of a run comes after nothing"),
         (3, |lines| drop(lines.remove(3)), "line 4: episode 4 of a run comes after episode 2"),
         (3, |lines| lines.retain(|line| !line.contains(",sac,")), "`sac` on `reach` with seed 0 is not in its tests"),
