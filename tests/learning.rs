@@ -8,6 +8,7 @@ use handful::agent::{
     Agent, Diagnostics, Dreamer, DreamerConfig, Mode, Oracle, OracleConfig, Pets, PetsConfig, Policy, Preset, Sac,
     SacConfig, Slot, TdMpc2, TdMpc2Config,
 };
+use handful::checkpoint::Weights;
 use handful::env::{Env, Snapshot, Step, Task, World};
 use handful::error::{Error, Result};
 use handful::model::{EnsembleConfig, ImplicitConfig, RssmConfig, WorldModelConfig};
@@ -197,6 +198,29 @@ fn acting_alone_is_acting_in_an_evaluation() {
             assert_eq!(rewards, batch.episodes[0].rewards, "{}", config.method);
         }
         assert_eq!(training_state(agent), before, "{}", config.method);
+    }
+}
+
+/// Target networks are not among the weights; where there is nothing else to go on with, they begin as copies of the critics.
+#[test]
+fn with_weights_alone_target_networks_equal_the_critics() {
+    let registry = Registry::standard();
+    let critics = ["critics.", "dreamer.behaviour.critic.", "tdmpc2.model.critics."];
+    for (config, critics) in [debug_run, small_dreamer, small_tdmpc2].into_iter().zip(critics) {
+        let mut method = registry.method(&config(7)).expect("a method");
+        let agent = method.as_learner().expect("it learns");
+        let mut env = Task::Reach.make();
+        for seed in 0..4 {
+            episode(&mut env, agent, seed);
+        }
+        let weights = agent.weights();
+        let target = |state: Weights| state.extract("target.");
+        assert_ne!(target(agent.training_state()), weights.extract(critics), "{critics} lag behind");
+
+        let mut method = registry.method(&config(8)).expect("a method");
+        let other = method.as_learner().expect("it learns");
+        other.load_weights(&weights).expect("weights of the same settings");
+        assert_eq!(target(other.training_state()), weights.extract(critics));
     }
 }
 

@@ -28,6 +28,7 @@ mod baselines;
 mod decision;
 pub mod dreamer;
 mod oracle;
+mod percentile;
 mod pets;
 mod presets;
 mod sac;

@@ -76,9 +76,9 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     };
     let folder = args.out.unwrap_or_else(|| Path::new("runs").join(name));
     let mut plan = StudyPlan::new(registry, profile, folder);
-    // The profile's budget is one for its own tasks.
-    plan.budget = plan.budget.filter(|_| args.tasks.is_none());
-    plan.tasks = args.tasks.unwrap_or(plan.tasks);
+    if let Some(tasks) = args.tasks {
+        plan = plan.with_tasks(tasks);
+    }
     plan.methods = args.methods.unwrap_or(plan.methods);
     plan.seeds = args.seeds.unwrap_or(plan.seeds);
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);

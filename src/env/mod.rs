@@ -239,6 +239,9 @@ pub trait KnownReward {
     }
 }
 
+/// A known reward, shared between threads.
+pub type SharedReward = std::sync::Arc<dyn KnownReward + Send + Sync>;
+
 /// An environment whose state can be saved and restored: from a restored state it steps on bit for bit as it did before.
 ///
 /// ```

@@ -42,7 +42,9 @@ pub fn polyak<P: Parameters>(target: &mut P, source: &P, rate: f32) {
 
 /// Gives `target` the parameters of `source`.
 pub fn copy_parameters<P: Parameters>(target: &mut P, source: &P) {
-    polyak(target, source, 1.0);
+    for ((_, target), (_, source)) in target.parameters_mut().into_iter().zip(source.parameters()) {
+        values_mut(target).copy_from_slice(values(source));
+    }
 }
 
 impl Weights {

@@ -320,6 +320,8 @@ mod tests {
                 assert!((found - expected).abs() < 1e-7, "{found}, expected {expected}");
             }
         }
+        let mean: f64 = weights(&[10.0, 9.0, 7.0], 1.0).iter().zip([0.2, -0.1, 0.9]).map(|(w, a)| w * a).sum();
+        assert!((mean - 0.146_734_38).abs() < 1e-7);
     }
 
     #[test]

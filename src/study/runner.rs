@@ -65,6 +65,12 @@ impl StudyPlan {
         }
     }
 
+    /// The same plan for other tasks. Its budget falls away: a profile's is one for its own tasks.
+    #[must_use]
+    pub fn with_tasks(self, tasks: Vec<String>) -> Self {
+        Self { tasks, budget: None, ..self }
+    }
+
     /// The runs, each with its folder. A method that does not learn runs once.
     ///
     /// # Errors

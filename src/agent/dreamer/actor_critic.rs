@@ -81,10 +81,17 @@ impl ActorCritic {
         let features = world.config().rssm.features();
         let policy = Mlp::dreamer(world.device(), features, &hidden, Some(2 * actions), rng).scale_output(0.01);
         let critic = Mlp::dreamer(world.device(), features, &hidden, Some(world.bins().count()), rng).scale_output(0.0);
+        let behaviour = Self { config: config.clone(), actions, policy, critic };
+        let target = behaviour.target_critic();
+        (behaviour, target)
+    }
+
+    /// A target network that is equal to the critic.
+    pub fn target_critic(&self) -> TargetCritic {
         // A copy with tensors of its own.
-        let mut target = critic.clone();
-        copy_parameters(&mut target, &critic);
-        (Self { config: config.clone(), actions, policy, critic }, target)
+        let mut target = self.critic.clone();
+        copy_parameters(&mut target, &self.critic);
+        target
     }
 
     /// Moves the target network towards the critic: `target <- (1 - rate) target + rate critic`.

@@ -252,12 +252,14 @@ impl Checkpoint for Dreamer {
     }
 
     fn load_weights(&mut self, weights: &Weights) -> Result<()> {
-        weights.load_module("dreamer", &mut self.networks)
+        weights.load_module("dreamer", &mut self.networks)?;
+        self.networks.target = self.networks.behaviour.target_critic();
+        Ok(())
     }
 
     fn training_state(&self) -> Weights {
         let mut state = Weights::default();
-        state.insert_module("slow", &self.networks.target);
+        state.insert_module("target", &self.networks.target);
         self.optimiser.save(&mut state, "optimiser");
         self.replay.save(&mut state, "replay");
         let [low, high] = self.scale.range();
@@ -274,7 +276,7 @@ impl Checkpoint for Dreamer {
         if !(0.0..1.0).contains(&update_credit) {
             return Err(Error::Config(format!("the credit of updates is {update_credit}; it must lie in 0..1")));
         }
-        state.load_module("slow", &mut self.networks.target)?;
+        state.load_module("target", &mut self.networks.target)?;
         self.optimiser.load(state, "optimiser", &self.networks)?;
         self.replay.load(state, "replay")?;
         let most = most_observed(self.replay.most_pushes(), self.config.action_repeat);

@@ -4,6 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::agent::percentile::percentile;
 use crate::replay::SequenceBatch;
 
 /// The lambda-returns of imagined rollouts (eq. 7):
@@ -107,14 +108,6 @@ impl ReturnScale {
     pub fn range(&self) -> [f32; 2] {
         [self.low, self.high]
     }
-}
-
-/// A percentile of sorted numbers, by linear interpolation.
-fn percentile(sorted: &[f32], share: f32) -> f32 {
-    let at = share * (sorted.len() - 1) as f32;
-    let (below, between) = (at.floor() as usize, at.fract());
-    let above = (below + 1).min(sorted.len() - 1);
-    sorted[below] + between * (sorted[above] - sorted[below])
 }
 
 #[cfg(test)]

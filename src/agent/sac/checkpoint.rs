@@ -8,7 +8,7 @@ use crate::agent::decision::{in_decisions, most_observed};
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
-use crate::nn::{Grad, ops, tensor};
+use crate::nn::{Grad, copy_parameters, ops, tensor};
 use crate::replay::Episode;
 
 impl Diagnostics for Sac {
@@ -35,7 +35,6 @@ impl Checkpoint for Sac {
         let mut weights = Weights::default();
         weights.insert_module("policy", &self.policy);
         weights.insert_module("critics", &self.critics);
-        weights.insert_module("targets", &self.target_critics);
         weights.insert("temperature", vec![self.temperature.log], [1, 1, 1]);
         weights
     }
@@ -44,13 +43,14 @@ impl Checkpoint for Sac {
         let log = weights.get("temperature", [1, 1, 1])?[0];
         weights.load_module("policy", &mut self.policy)?;
         weights.load_module("critics", &mut self.critics)?;
-        weights.load_module("targets", &mut self.target_critics)?;
+        copy_parameters(&mut self.target_critics, &self.critics);
         self.temperature.log = log;
         Ok(())
     }
 
     fn training_state(&self) -> Weights {
         let mut state = Weights::default();
+        state.insert_module("target", &self.target_critics);
         self.policy_optimiser.save(&mut state, "policy");
         self.critic_optimiser.save(&mut state, "critics");
         self.replay.save(&mut state, "replay");
@@ -66,6 +66,7 @@ impl Checkpoint for Sac {
         let &[first, second, steps] = state.get_within("temperature", [1, 1, 3], -1e9..=1e9)? else {
             unreachable!("three numbers")
         };
+        state.load_module("target", &mut self.target_critics)?;
         self.policy_optimiser.load(state, "policy", &self.policy)?;
         self.critic_optimiser.load(state, "critics", &self.critics)?;
         self.replay.load(state, "replay")?;

@@ -5,11 +5,9 @@
 //! [`Role::Difference`]; the dynamic one is what was achieved. The new goal is what a later time step of the same episode achieved
 //! (the paper's strategy *future*), the difference is computed anew, and so is the reward, which therefore has to be known.
 
-use std::sync::Arc;
-
 use rand::RngExt;
 
-use crate::env::{KnownReward, Role, Spec};
+use crate::env::{Role, SharedReward, Spec};
 use crate::error::{Error, Result};
 use crate::model::FeatureMap;
 use crate::replay::{Batch, ReplayBuffer, Row};
@@ -23,11 +21,11 @@ pub(super) struct Hindsight {
     goals: Vec<[usize; 2]>,
     /// `[index, minuend, subtrahend]`.
     differences: Vec<[usize; 3]>,
-    reward: Arc<dyn KnownReward + Send + Sync>,
+    reward: SharedReward,
 }
 
 impl Hindsight {
-    pub(super) fn new(spec: &Spec, reward: Option<Arc<dyn KnownReward + Send + Sync>>, share: f32) -> Result<Self> {
+    pub(super) fn new(spec: &Spec, reward: Option<SharedReward>, share: f32) -> Result<Self> {
         let refused = |what: &str| Error::Config(format!("`sac.hindsight` is {share}, but {} {what}", spec.name));
         let reward = reward.filter(|reward| reward.is_known());
         let reward = reward.ok_or_else(|| refused("has no reward that is known as a function of observations"))?;
@@ -71,8 +69,10 @@ impl Hindsight {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
-    use crate::env::{Env, Feature, Task};
+    use crate::env::{Env, Feature, KnownReward, Task};
     use crate::replay::Transition;
     use crate::rng;
 

@@ -21,8 +21,6 @@ mod hindsight;
 mod inputs;
 mod temperature;
 
-use std::sync::Arc;
-
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
@@ -35,7 +33,7 @@ use temperature::Temperature;
 use super::decision::{Decision, Held};
 use super::warm_up::RandomActions;
 use super::{Losses, Slots};
-use crate::env::{KnownReward, Spec};
+use crate::env::{SharedReward, Spec};
 use crate::error::Result;
 use crate::nn::ops;
 use crate::nn::{
@@ -116,12 +114,7 @@ impl Sac {
     ///
     /// # Errors
     /// As [`Sac::new`], or if the settings ask for hindsight where there is no goal or the reward is not known.
-    pub fn with_reward(
-        spec: &Spec,
-        reward: Option<Arc<dyn KnownReward + Send + Sync>>,
-        config: SacConfig,
-        seed: u64,
-    ) -> Result<Self> {
+    pub fn with_reward(spec: &Spec, reward: Option<SharedReward>, config: SacConfig, seed: u64) -> Result<Self> {
         config.check_at("sac")?;
         spec.check()?;
         let share = config.hindsight;

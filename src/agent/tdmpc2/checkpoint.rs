@@ -9,6 +9,7 @@ use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::model::Probed;
 use crate::model::open_loop::{OfDecisions, OpenLoop, open_loop};
+use crate::nn::copy_parameters;
 use crate::replay::Episode;
 use crate::rng;
 
@@ -51,12 +52,14 @@ impl Checkpoint for TdMpc2 {
 
     fn load_weights(&mut self, weights: &Weights) -> Result<()> {
         weights.load_module("tdmpc2", &mut self.networks)?;
+        copy_parameters(&mut self.networks.target, self.networks.model.critics());
         self.frozen = None;
         Ok(())
     }
 
     fn training_state(&self) -> Weights {
         let mut state = Weights::default();
+        state.insert_module("target", &self.networks.target);
         self.model_optimiser.save(&mut state, "model");
         self.policy_optimiser.save(&mut state, "policy");
         self.probe_optimiser.save(&mut state, "probe");
@@ -77,6 +80,7 @@ impl Checkpoint for TdMpc2 {
         let &[update_credit] = state.get_within("update_credit", [1, 1, 1], 0.0..=due)? else {
             unreachable!("one number")
         };
+        state.load_module("target", &mut self.networks.target)?;
         self.model_optimiser.load(state, "model", &self.networks.model)?;
         self.policy_optimiser.load(state, "policy", &self.networks.policy)?;
         self.probe_optimiser.load(state, "probe", &self.networks.probe)?;

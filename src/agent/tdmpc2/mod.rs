@@ -111,7 +111,7 @@ struct Networks {
     actions: usize,
 }
 
-parameters_of_fields!(Networks: model, policy, target, probe);
+parameters_of_fields!(Networks: model, policy, probe);
 
 impl Networks {
     fn new(spec: &Spec, config: &TdMpc2Config, rng: &mut Rng) -> Self {

@@ -1,5 +1,7 @@
 //! The running scale of the values that the policy climbs.
 
+use crate::agent::percentile::percentile;
+
 /// Rate at which the scale follows.
 const RATE: f32 = 0.01;
 
@@ -32,13 +34,6 @@ impl RunningScale {
         let range = percentile(&sorted, 0.95) - percentile(&sorted, 0.05);
         self.0 += RATE * (range.max(1.0) - self.0);
     }
-}
-
-/// With linear interpolation between the closest ranks.
-fn percentile(sorted: &[f32], share: f32) -> f32 {
-    let position = share * (sorted.len() - 1) as f32;
-    let lower = sorted[position.floor() as usize];
-    lower + position.fract() * (sorted[position.ceil() as usize] - lower)
 }
 
 #[cfg(test)]

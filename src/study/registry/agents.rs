@@ -3,11 +3,11 @@
 use toml::Table;
 
 use super::Registry;
-use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, SharedReward, completed, in_range};
+use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, completed, in_range};
 use crate::agent::{
     Dreamer, DreamerConfig, Method, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, TdMpc2, TdMpc2Config,
 };
-use crate::env::Spec;
+use crate::env::{SharedReward, Spec};
 use crate::error::{Error, Result};
 use crate::settings::{Ranges, choices};
 

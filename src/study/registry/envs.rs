@@ -10,7 +10,7 @@ use toml::{Table, Value};
 use super::Registry;
 use crate::agent::{Method, Oracle, OracleConfig, Scripted};
 use crate::env::tabletop::{ObservationKind, TableOptions, TableTask, Tabletop};
-use crate::env::{Env, KnownReward, Snapshot, Task};
+use crate::env::{Env, KnownReward, SharedReward, Snapshot, Task};
 use crate::error::{Error, Result};
 use crate::settings::{Ranges, choices};
 use crate::study::config::settings_table;
@@ -25,8 +25,6 @@ impl<S: Serialize + DeserializeOwned + Default + Send + Sync + 'static> Settings
 #[serde(deny_unknown_fields)]
 pub struct NoOptions {}
 
-/// A known reward, shared between threads.
-pub(super) type SharedReward = Arc<dyn KnownReward + Send + Sync>;
 type Make<O, T> = Arc<dyn Fn(&O) -> Result<T> + Send + Sync>;
 type MakeOracle<O> = Arc<dyn Fn(&O, OracleConfig, u64) -> Result<Method> + Send + Sync>;
 
