@@ -113,10 +113,12 @@ fn mathml(latex: &str, display_mode: DisplayMode) -> anyhow::Result<String> {
     let events = events.map_err(|error| anyhow::anyhow!("formula `{latex}`: {error}"))?;
     let mut html = String::new();
     push_mathml(&mut html, events.into_iter().map(Ok::<_, std::convert::Infallible>), config)?;
-    // The renderer escapes the entity that it writes for a space (`\ `); and what has a meaning in Markdown is escaped: two tildes,
-    // for example, would strike out the text between them.
-    let escapes = [("&amp;nbsp;", "&#160;"), ("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")];
-    Ok(escapes.into_iter().fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
+    // The renderer escapes the entity that it writes for a space (`\ `), and leaves out a space between two attributes of `\big(`, so
+    // that the bracket would be no tag. What has a meaning in Markdown is escaped: two tildes, for example, would strike out the text
+    // between them.
+    let mend = [("&amp;nbsp;", "&#160;"), ("\"minsize", "\" minsize")];
+    let escapes = mend.into_iter().chain([("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")]);
+    Ok(escapes.fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
 }
 
 #[cfg(test)]
@@ -133,6 +135,8 @@ mod tests {
         assert!(!tildes.contains('~') && tildes.contains("&#126;"), "{tildes}");
         let space = formulas("$a,\\ b$").expect("a formula");
         assert!(!space.contains("nbsp") && space.contains("&#160;"), "{space}");
+        let bracket = formulas("$\\big( a \\Big]$").expect("a formula");
+        assert_eq!(bracket.matches("\" minsize=").count(), 2, "{bracket}");
     }
 
     #[test]
