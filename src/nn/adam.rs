@@ -137,12 +137,16 @@ impl Adam {
             (name, parameter, gradient, moments)
         });
         let mut work: Vec<_> = work.collect();
-        let squares: Vec<f64> = work.par_iter().map(|(_, _, gradient, _)| sum_of_squares(gradient)).collect();
+        // With few numbers, a second core costs more than it saves.
+        let few = work.iter().map(|(_, _, gradient, _)| gradient.len()).sum::<usize>() < 65_536;
+        let least = if few { work.len().max(1) } else { 1 };
+        let norms = work.par_iter().with_min_len(least);
+        let squares: Vec<f64> = norms.map(|(_, _, gradient, _)| sum_of_squares(gradient)).collect();
         let norm = squares.iter().sum::<f64>().sqrt() as f32;
         let clip = self.config.max_norm.map_or(1.0, |max| (max / norm.max(f32::MIN_POSITIVE)).min(1.0));
         self.steps += 1;
         let (rule, slower) = (Rule::new(&self.config, self.steps, clip), self.slower);
-        work.par_iter_mut().for_each(|(name, parameter, gradient, [first, second])| {
+        work.par_iter_mut().with_min_len(least).for_each(|(name, parameter, gradient, [first, second])| {
             let decay =
                 if name.ends_with("weight") { self.config.learning_rate * self.config.weight_decay } else { 0.0 };
             let parameter = values_mut(parameter);

@@ -72,23 +72,27 @@ pub fn dense<T: Tape<f32, Cpu>>(
         tape.add_backward_op(move |gradients| {
             let mut dz = take(gradients, &y)?;
             kernels::through_activation(&mut dz, before.as_deref().unwrap_or(values(&y)), activation);
-            // Both at once: neither waits for the other's last task.
             let (to_parameters, to_input) = (grad != Grad::Input, grad != Grad::Params);
             let mut of_parameters =
                 to_parameters.then(|| Ok((take(gradients, &w)?, take(gradients, &b)?))).transpose()?;
             let mut of_input = to_input.then(|| take(gradients, &x)).transpose()?;
-            rayon::join(
-                || {
-                    if let Some((dw, db)) = &mut of_parameters {
-                        kernels::dense_parameter_gradients(dw, db, values(&x), &dz, shape);
-                    }
-                },
-                || {
-                    if let Some(dx) = &mut of_input {
-                        kernels::dense_input_gradient(dx, &dz, values(&w), shape);
-                    }
-                },
-            );
+            let mut parameters = || {
+                if let Some((dw, db)) = &mut of_parameters {
+                    kernels::dense_parameter_gradients(dw, db, values(&x), &dz, shape);
+                }
+            };
+            let mut inputs = || {
+                if let Some(dx) = &mut of_input {
+                    kernels::dense_input_gradient(dx, &dz, values(&w), shape);
+                }
+            };
+            if shape.is_large() {
+                // Both at once: neither waits for the other's last task.
+                rayon::join(parameters, inputs);
+            } else {
+                parameters();
+                inputs();
+            }
             if let Some((dw, db)) = of_parameters {
                 **gradients.get_or_alloc_mut(&w)? = dw;
                 **gradients.get_or_alloc_mut(&b)? = db;

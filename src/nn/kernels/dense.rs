@@ -20,14 +20,26 @@ pub struct DenseShape {
     pub shared_input: bool,
 }
 
+/// Below this many multiplications a second core costs more than it saves.
+const ENOUGH: usize = 2_000_000;
+
 impl DenseShape {
+    /// Whether a product of matrices of these sizes is worth a second core.
+    pub(crate) fn is_large(&self) -> bool {
+        self.members * self.batch * self.input * self.output >= ENOUGH
+    }
+
+    /// Networks, or parts of them, that one thread takes at least: all of them if there is little work.
+    fn least_tasks(&self) -> usize {
+        if self.is_large() { 1 } else { usize::MAX }
+    }
+
     /// Rows handed to one thread at a time, so that every core has work.
     fn rows_per_task(&self, rows: usize) -> usize {
         // A network is one task if networks divide evenly among threads; otherwise it is cut so that its parts do.
         let threads = rayon::current_num_threads();
         let tasks = (1..=threads).find(|tasks| (tasks * self.members).is_multiple_of(threads)).unwrap_or(1);
-        // Below this much work a second core costs more than it saves.
-        let enough = 2_000_000 / (self.input * self.output).max(1);
+        let enough = ENOUGH / (self.input * self.output).max(1);
         rows.div_ceil(tasks).max(enough).min(rows).max(1)
     }
 
@@ -74,7 +86,7 @@ pub fn dense(
             add_and_activate(y, b, activation);
         }
     };
-    let parts = shape.tasks(y, rows).into_par_iter();
+    let parts = shape.tasks(y, rows).into_par_iter().with_min_len(shape.least_tasks());
     match before.map(|before| shape.tasks(before, rows)) {
         Some(kept) => parts.zip(kept).enumerate().for_each(|(task, (y, before))| work(task, y, Some(before))),
         None => parts.enumerate().for_each(|(task, y)| work(task, y, None)),
@@ -97,7 +109,8 @@ pub fn dense_input_gradient(dx: &mut [f32], dz: &[f32], w: &[f32], shape: DenseS
     if shape.shared_input {
         (0..shape.members).for_each(|member| one(member, dx));
     } else {
-        dx.par_chunks_mut(shape.batch * shape.input).enumerate().for_each(|(member, dx)| one(member, dx));
+        let members = dx.par_chunks_mut(shape.batch * shape.input).with_min_len(shape.least_tasks());
+        members.enumerate().for_each(|(member, dx)| one(member, dx));
     }
 }
 
@@ -106,7 +119,7 @@ pub fn dense_parameter_gradients(dw: &mut [f32], db: &mut [f32], x: &[f32], dz: 
     // Columns of x are rows of dw.
     let rows = shape.rows_per_task(shape.input);
     let members = dw.par_chunks_mut(shape.input * shape.output).zip(db.par_chunks_mut(shape.output));
-    members.enumerate().for_each(|(member, (dw, db))| {
+    members.with_min_len(shape.least_tasks()).enumerate().for_each(|(member, (dw, db))| {
         let x = shape.input_of(x, member);
         let dz = &dz[member * shape.batch * shape.output..][..shape.batch * shape.output];
         dw.par_chunks_mut(rows * shape.output).enumerate().for_each(|(task, dw)| {
