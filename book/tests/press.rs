@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use handful_book::chapter::{Chapter, Part};
 use handful_book::page::Page;
 use handful_book::{format, notebook};
+use pulldown_cmark::{Event, Options, Tag, TagEnd, TextMergeStream};
 use serde_json::json;
 
 fn root() -> PathBuf {
@@ -35,6 +36,28 @@ fn every_formula_can_be_read() {
     for chapter in chapters() {
         if let Err(error) = Page::new(&chapter, &[]) {
             panic!("chapters/{}.md: {error}", chapter.name);
+        }
+    }
+}
+
+/// What is malformed stays as text on the page: a tag of a formula, or an alert with text behind its `[!NOTE]`.
+#[test]
+fn every_tag_and_every_alert_is_one_to_markdown() {
+    for chapter in chapters() {
+        let page = Page::new(&chapter, &[]).expect("a page").content;
+        let events =
+            TextMergeStream::new(pulldown_cmark::Parser::new_ext(&page, Options::ENABLE_GFM | Options::ENABLE_TABLES));
+        let mut in_code = false;
+        for event in events {
+            match event {
+                Event::Start(Tag::CodeBlock(_)) => in_code = true,
+                Event::End(TagEnd::CodeBlock) => in_code = false,
+                Event::Text(text) if !in_code => {
+                    let malformed = text.contains("=\"") || text.contains("</") || text.contains("[!");
+                    assert!(!malformed, "chapters/{}.md: `{text}` is neither a tag nor an alert", chapter.name);
+                }
+                _ => {}
+            }
         }
     }
 }
