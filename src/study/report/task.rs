@@ -172,8 +172,7 @@ fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<Str
         (Some(ratio), (Some(low), None)) => {
             text += &format!(
                 " To {level:.0} % success `{BASELINE}` takes at least {ratio:.1} times as many steps (its censored seeds \
-                 count as its budget; 95 % interval from {low:.1}{}).",
-                ends("sac_steps_ratio_t")?.0.map_or(String::new(), |low| format!(", t interval from {low:.1}"))
+                 count as its budget; 95 % interval from {low:.1}).",
             );
         }
         _ => {}
