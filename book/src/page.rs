@@ -116,9 +116,15 @@ fn mathml(latex: &str, display_mode: DisplayMode) -> anyhow::Result<String> {
     // The renderer escapes the entity that it writes for a space (`\ `), and leaves out a space between two attributes of `\big(`, so
     // that the bracket would be no tag. What has a meaning in Markdown is escaped: two tildes, for example, would strike out the text
     // between them.
-    let mend = [("&amp;nbsp;", "&#160;"), ("\"minsize", "\" minsize")];
-    let escapes = mend.into_iter().chain([("~", "&#126;"), ("*", "&#42;"), ("_", "&#95;"), ("\n", " ")]);
-    Ok(escapes.fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
+    let escapes = [
+        ("&amp;nbsp;", "&#160;"),
+        ("\"minsize", "\" minsize"),
+        ("~", "&#126;"),
+        ("*", "&#42;"),
+        ("_", "&#95;"),
+        ("\n", " "),
+    ];
+    Ok(escapes.into_iter().fold(html, |html, (mark, escaped)| html.replace(mark, escaped)))
 }
 
 #[cfg(test)]

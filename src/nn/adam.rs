@@ -139,7 +139,7 @@ impl Adam {
         let mut work: Vec<_> = work.collect();
         // With few numbers, a second core costs more than it saves.
         let few = work.iter().map(|(_, _, gradient, _)| gradient.len()).sum::<usize>() < 65_536;
-        let least = if few { work.len().max(1) } else { 1 };
+        let least = if few { usize::MAX } else { 1 };
         let norms = work.par_iter().with_min_len(least);
         let squares: Vec<f64> = norms.map(|(_, _, gradient, _)| sum_of_squares(gradient)).collect();
         let norm = squares.iter().sum::<f64>().sqrt() as f32;
