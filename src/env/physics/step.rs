@@ -69,9 +69,11 @@ impl Physics {
             finger.add_force(push, true);
             bodies[self.links[JOINTS - 1]].add_force_at_point(-push, at, true);
         }
-        self.world.integration_parameters.num_solver_iterations =
-            if self.squeezes() { SUBSTEPS_SQUEEZED } else { SUBSTEPS };
-        let grip = self.grip();
+        let squeezes = self.squeezes();
+        self.world.integration_parameters.num_solver_iterations = if squeezes { SUBSTEPS_SQUEEZED } else { SUBSTEPS };
+        // With substeps, the velocity at the end is not that of the whole step: an impact may have reversed the hand. (And an object
+        // stays behind by a twelfth only.)
+        let grip = if squeezes { None } else { self.grip() };
         self.world.step();
         if let Some(grip) = grip {
             grip.carry(self);
