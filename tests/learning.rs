@@ -401,11 +401,12 @@ fn so_does_one_that_plans() {
 fn so_does_one_that_dreams() {
     let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "values.csv", "test.csv"];
     ends_as_if_it_had_never_stopped(&small_dreamer(1), &files);
-    // And if it plans in its dreams.
+    // And if it plans in its dreams, and has a target entropy.
     let planning = small_dreamer(2);
     let mut dreamer: DreamerConfig = planning.settings().expect("Dreamer's settings");
     let planner = IcemConfig { horizon: 4, population: 10, elites: 4, iterations: 2, ..IcemConfig::default() };
     dreamer.planner = Some(PlannerConfig::Icem(planner));
+    dreamer.behaviour.target_entropy = Some(0.5);
     ends_as_if_it_had_never_stopped(&planning.with_settings(&dreamer), &files);
 }
 

@@ -34,6 +34,7 @@ mod presets;
 mod sac;
 mod slots;
 mod tdmpc2;
+mod temperature;
 mod warm_up;
 
 pub use baselines::{Random, Scripted};

@@ -22,6 +22,8 @@ use crate::rng::{self, Rng};
 pub struct ActorCritic {
     pub(super) config: ActorCriticConfig,
     pub(super) actions: usize,
+    /// The coefficient of the entropy bonus, eta.
+    pub(super) entropy: f32,
     pub(super) policy: Mlp,
     pub(super) critic: Mlp,
 }
@@ -81,7 +83,7 @@ impl ActorCritic {
         let features = world.config().rssm.features();
         let policy = Mlp::dreamer(world.device(), features, &hidden, Some(2 * actions), rng).scale_output(0.01);
         let critic = Mlp::dreamer(world.device(), features, &hidden, Some(world.bins().count()), rng).scale_output(0.0);
-        let behaviour = Self { config: config.clone(), actions, policy, critic };
+        let behaviour = Self { config: config.clone(), actions, entropy: config.entropy, policy, critic };
         let target = behaviour.target_critic();
         (behaviour, target)
     }
@@ -214,10 +216,10 @@ impl ActorCritic {
             let normal = self.distribution(head, i);
             log_density += normal.log_density(*action);
             entropy += normal.entropy();
-            let [of_mean, of_std] = normal.slopes(*action, -weight * advantage, -weight * self.config.entropy);
+            let [of_mean, of_std] = normal.slopes(*action, -weight * advantage, -weight * self.entropy);
             (slope[i], slope[self.actions + i]) = (of_mean, of_std);
         }
-        (-weight * (log_density * advantage + self.config.entropy * entropy), entropy)
+        (-weight * (log_density * advantage + self.entropy * entropy), entropy)
     }
 
     /// The critic's loss: the two-hot cross-entropies of both `targets` (the lambda-returns, and the target network's values

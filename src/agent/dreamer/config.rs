@@ -138,6 +138,13 @@ pub struct ActorCriticConfig {
     pub lambda: f32,
     /// Coefficient of the policy's entropy bonus, per nat, in units of the return scale.
     pub entropy: f32,
+    /// The policy's target entropy in nats, for each number of an action: if there is one, the coefficient starts at `entropy` and
+    /// is tuned towards it, as SAC's temperature is. 1.42 is the most, with a standard deviation of 1. The published coefficient is
+    /// constant.
+    #[doc(alias = "automatic temperature")]
+    pub target_entropy: Option<f32>,
+    /// Step size of the coefficient's logarithm (Adam), with a target entropy.
+    pub entropy_rate: f32,
     /// How the actor learns.
     pub gradient: ActorGradient,
     /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic is
@@ -160,6 +167,8 @@ impl Default for ActorCriticConfig {
             horizon: 15,
             lambda: 0.95,
             entropy: 3e-4,
+            target_entropy: None,
+            entropy_rate: 1e-3,
             gradient: ActorGradient::default(),
             center_advantages: false,
             min_std: 0.1,
@@ -175,9 +184,13 @@ ranges!(ActorCriticConfig {
     horizon: 1..=1000,
     lambda: 0.0..=1.0,
     entropy: 0.0..=1e3,
+    target_entropy: -100.0..=100.0,
+    entropy_rate: 0.0..=1.0,
     gradient: Any,
     center_advantages: Any,
     min_std: 1e-4..=0.999,
     target_rate: 0.0..=1.0,
     replayed: 0.0..=1e3,
-});
+}
+require target_entropy.is_none() || *entropy > 0.0 => "with a `target_entropy`, `entropy` must not be 0";
+);

@@ -38,7 +38,7 @@ impl ActorCritic {
                     self.reparametrised(head, &noise[row * self.actions..], action, jacobian);
                 })
             });
-            let bonus = |row: usize| -rollout.weights[t][row] * self.config.entropy;
+            let bonus = |row: usize| -rollout.weights[t][row] * self.entropy;
             let entropy = tape.rowwise(&head, |row, head, slope| self.entropy(head, bonus(row), slope));
             losses.push((1.0 / horizon as f32, entropy));
             latent = world.imagine_on(tape, &latent, &action, rng);

@@ -7,8 +7,9 @@
 //! version. Deviations: there is one environment, the first actions are random (`warm_up`), the replay buffer is smaller, its
 //! sequences start with a latent state of zeros, new experience has no precedence in it, positions are seen as differences
 //! (`model/features/latent.rs`), and in evaluation the policy acts by its mean. Optional: rollouts from a part of the states
-//! (`dreams`), exploration with coloured noise, a group lasso on the encoder's inputs, with a probe that reconstructs what it
-//! prunes. PlaNet has Gaussian states and the KL divergence in its loss once.
+//! (`dreams`), exploration with coloured noise, an entropy coefficient tuned towards a target entropy, a group lasso on the
+//! encoder's inputs, with a probe that reconstructs what it prunes. PlaNet has Gaussian states and the KL divergence in its loss
+//! once.
 //!
 //! ```
 //! use handful::agent::dreamer::DreamerConfig;
@@ -41,6 +42,7 @@ pub use returns::{ReturnScale, lambda_returns, replay_lambda_returns};
 use update::Networks;
 
 use super::decision::{Decision, Over, in_decisions, most_observed};
+use super::temperature::Temperature;
 use super::warm_up::RandomActions;
 use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots, ValueEstimate};
 use crate::checkpoint::Weights;
@@ -65,6 +67,7 @@ pub struct Dreamer {
     networks: Networks,
     optimiser: Adam,
     scale: ReturnScale,
+    temperature: Temperature,
     replay: SequenceReplay,
     observed: usize,
     /// Updates that are due by the replay ratio (`train_ratio`).
@@ -110,6 +113,7 @@ impl Dreamer {
             networks: Networks { world, behaviour, target },
             optimiser: Adam::new(optimiser),
             scale: ReturnScale::default(),
+            temperature: Temperature::new(config.behaviour.entropy, config.behaviour.entropy_rate),
             replay: SequenceReplay::new(spec.observation_size(), spec.action_size, config.replay),
             observed: 0,
             update_credit: 0.0,
@@ -264,6 +268,9 @@ impl Checkpoint for Dreamer {
         self.replay.save(&mut state, "replay");
         let [low, high] = self.scale.range();
         state.insert("progress", vec![low, high, self.update_credit], [1, 1, 3]);
+        if self.config.behaviour.target_entropy.is_some() {
+            self.temperature.save(&mut state);
+        }
         state.insert_counts("counts", &[self.observed as u64]);
         state.insert_rng("rng", &self.rng);
         state.insert_rng("mind rng", &self.policy_state.rng);
@@ -275,6 +282,10 @@ impl Checkpoint for Dreamer {
         let &[low, high, update_credit] = state.get("progress", [1, 1, 3])? else { unreachable!("three numbers") };
         if !(0.0..1.0).contains(&update_credit) {
             return Err(Error::Config(format!("the credit of updates is {update_credit}; it must lie in 0..1")));
+        }
+        if self.config.behaviour.target_entropy.is_some() {
+            self.temperature.load(state)?;
+            self.networks.behaviour.entropy = self.temperature.alpha();
         }
         state.load_module("target", &mut self.networks.target)?;
         self.optimiser.load(state, "optimiser", &self.networks)?;

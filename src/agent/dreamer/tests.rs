@@ -74,6 +74,20 @@ fn centred_advantages_do_not_depend_on_the_level_of_values() {
     }
 }
 
+/// A new policy has 1.3 nats for each number of an action.
+#[test]
+fn too_much_entropy_lowers_its_bonus_and_too_little_raises_it() {
+    for (target_entropy, rises) in [(0.5, false), (1.4, true)] {
+        let mut config = small();
+        config.behaviour.target_entropy = Some(target_entropy);
+        let before = config.behaviour.entropy;
+        let mut agent = experienced(config, 50);
+        let learned: Vec<f32> = (0..3).map(|_| agent.learn()["temperature"]).collect();
+        assert!(learned.iter().all(|after| *after != before && (*after > before) == rises), "{before} {learned:?}");
+        assert_eq!(agent.networks.behaviour.entropy, learned[2]);
+    }
+}
+
 /// How the actor learns is its own affair: the world model learns the same, and so does the critic.
 #[test]
 fn gradients_through_the_dynamics_stay_in_the_actor() {

@@ -71,6 +71,11 @@ impl Dreamer {
         losses.insert("return_scale", scale);
         let Networks { behaviour, target, .. } = &mut self.networks;
         behaviour.update_target(target);
+        if let Some(target_entropy) = behaviour.config.target_entropy {
+            self.temperature.step(target_entropy * behaviour.actions as f32 - losses["policy_entropy"]);
+            behaviour.entropy = self.temperature.alpha();
+            losses.insert("temperature", behaviour.entropy);
+        }
         losses
     }
 }

@@ -3,8 +3,8 @@
 use dfdx::prelude::*;
 
 use super::Sac;
-use super::temperature::Temperature;
 use crate::agent::decision::{in_decisions, most_observed};
+use crate::agent::temperature::Temperature;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;

@@ -19,7 +19,6 @@ mod checkpoint;
 mod config;
 mod hindsight;
 mod inputs;
-mod temperature;
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -28,9 +27,9 @@ use backup::soft_bellman_backup;
 pub use config::SacConfig;
 use hindsight::Hindsight;
 use inputs::Inputs;
-use temperature::Temperature;
 
 use super::decision::{Decision, Held};
+use super::temperature::Temperature;
 use super::warm_up::RandomActions;
 use super::{Losses, Slots};
 use crate::env::{SharedReward, Spec};

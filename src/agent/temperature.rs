@@ -1,25 +1,42 @@
 //! The temperature alpha, tuned automatically so that the policy keeps a target entropy.
 
+use crate::checkpoint::Weights;
+use crate::error::Result;
 use crate::nn::adam_step;
 
 /// The temperature, with the state of its optimiser (Adam). What is learned is its logarithm.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Temperature {
+pub(in crate::agent) struct Temperature {
     /// ln(alpha).
-    pub(super) log: f32,
+    pub(in crate::agent) log: f32,
     rate: f32,
-    pub(super) moments: [f32; 2],
-    pub(super) steps: i32,
+    pub(in crate::agent) moments: [f32; 2],
+    pub(in crate::agent) steps: i32,
 }
 
 impl Temperature {
-    pub(super) fn new(start: f32, rate: f32) -> Self {
+    pub(in crate::agent) fn new(start: f32, rate: f32) -> Self {
         Self { log: start.ln(), rate, moments: [0.0; 2], steps: 0 }
     }
 
     /// alpha.
-    pub(super) fn alpha(&self) -> f32 {
+    pub(in crate::agent) fn alpha(&self) -> f32 {
         self.log.exp()
+    }
+
+    /// Adds the temperature and its optimiser to what is saved.
+    pub(in crate::agent) fn save(&self, state: &mut Weights) {
+        let [first, second] = self.moments;
+        state.insert("temperature", vec![self.log, first, second, self.steps as f32], [1, 1, 4]);
+    }
+
+    /// Takes over what [`Temperature::save`] saved.
+    pub(in crate::agent) fn load(&mut self, state: &Weights) -> Result<()> {
+        let &[log, first, second, steps] = state.get_within("temperature", [1, 1, 4], -1e9..=1e9)? else {
+            unreachable!("four numbers")
+        };
+        *self = Self { log, moments: [first, second], steps: steps.max(0.0) as i32, ..*self };
+        Ok(())
     }
 
     /// One step on the temperature loss (Haarnoja et al. 2018, equation 18)
@@ -31,7 +48,7 @@ impl Temperature {
     /// where H is the target entropy and `entropy_gap` is how far the entropy is below it: too little entropy raises the
     /// temperature. As in Stable-Baselines3, ln(alpha) stands for alpha: the loss is -ln(alpha) * entropy_gap, and its
     /// gradient with respect to ln(alpha) is -entropy_gap.
-    pub(super) fn step(&mut self, entropy_gap: f32) {
+    pub(in crate::agent) fn step(&mut self, entropy_gap: f32) {
         let gradient = -entropy_gap;
         self.steps += 1;
         let corrections = [0.9_f32, 0.999].map(|beta| 1.0 - beta.powi(self.steps));
