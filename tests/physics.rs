@@ -404,7 +404,7 @@ fn no_cube_is_pressed_into_the_table() {
         .collect();
     let mut depths: Vec<f64> = episodes.into_par_iter().map(|(task, seed)| pressed_in(task, seed)).collect();
     depths.sort_by(f64::total_cmp);
-    // Over 72,000 control steps, with five shakes, it was 1.9 mm.
+    // Over 72,000 control steps each, with 65 shakes, it was 2.73 mm at most.
     let worst = 1e3 * depths[depths.len() - 1];
     println!("pressed in by {worst:.2} mm");
     assert!(worst < 3.0, "pressed in by {worst:.2} mm");

@@ -134,6 +134,15 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         steps if steps < 1000 => steps.to_string(),
         steps => format!("{},{:03}", steps / 1000, steps % 1000),
     };
+    let ratio = |study: &str, method: &str| {
+        let [ratio, low, high] = ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"]
+            .map(|column| in_study(study, study, method, column));
+        match method {
+            "sac" => "1".into(),
+            _ if ratio.is_nan() => "-".into(),
+            _ => format!("{ratio:.1} [{low:.1}, {high:.1}]"),
+        }
+    };
     let mut quotes: Vec<(&str, String)> = Vec::new();
     for (name, method) in
         [("random", "random"), ("scripted (by hand)", "scripted"), ("oracle (plans on the true simulator)", "oracle")]
@@ -148,17 +157,8 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("PETS (learns the reward)", "pets-learned", 1),
         ("Dreamer", "dreamer", 2),
     ] {
-        let [steps, ratio, low, high, ms, sparc] = [
-            "steps_to_80",
-            "sac_steps_ratio",
-            "sac_steps_ratio_t_low",
-            "sac_steps_ratio_t_high",
-            "action_ms",
-            "smoothness_sparc",
-        ]
-        .map(|column| reach(method, column));
-        let ratio = if method == "sac" { "1".into() } else { format!("{ratio:.1} [{low:.1}, {high:.1}]") };
-        let (success, steps) = (success("reach", "reach", method), thousands(steps));
+        let [steps, ms, sparc] = ["steps_to_80", "action_ms", "smoothness_sparc"].map(|column| reach(method, column));
+        let (success, steps, ratio) = (success("reach", "reach", method), thousands(steps), ratio("reach", method));
         quotes.push(("README.md", format!("| {name} | {success} | {steps} | {ratio} | {ms:.digits$} | {sparc:.2} |")));
         assert_eq!(reach(method, "seeds_reaching_80"), 5.0);
     }
@@ -170,22 +170,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("Dreamer", "dreamer"),
         ("PETS (learns the reward)", "pets-learned"),
     ] {
-        let [steps, seeds, ratio, low, high, sparc] = [
-            "steps_to_80",
-            "seeds_reaching_80",
-            "sac_steps_ratio",
-            "sac_steps_ratio_t_low",
-            "sac_steps_ratio_t_high",
-            "smoothness_sparc",
-        ]
-        .map(|column| lift(method, column));
+        let [steps, seeds, sparc] =
+            ["steps_to_80", "seeds_reaching_80", "smoothness_sparc"].map(|column| lift(method, column));
         let steps = if steps.is_nan() { "-".into() } else { thousands(steps) };
-        let ratio = match method {
-            "sac" => "1".into(),
-            _ if ratio.is_nan() => "-".into(),
-            _ => format!("{ratio:.1} [{low:.1}, {high:.1}]"),
-        };
-        let success = success("lift", "lift", method);
+        let (success, ratio) = (success("lift", "lift", method), ratio("lift", method));
         quotes.push(("README.md", format!("| {name} | {success} | {steps} ({seeds}) | {ratio} | {sparc:.1} |")));
     }
     let [pets, learned] = ["pets", "pets-learned"].map(|method| success("lift", "lift", method));
@@ -196,6 +184,8 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("README.md", format!("it lifted in {learned} after 20,000")),
         ("chapters/06-pets.md", both),
     ]);
+    let reaching = ["pets", "sac", "tdmpc2", "dreamer", "pets-learned"].map(|method| lift(method, "seeds_reaching_80"));
+    assert_eq!(reaching, [5.0, 5.0, 5.0, 1.0, 0.0]);
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| push("pets", column));
     let sparc = ["pets", "sac"].map(|method| push(method, "smoothness_sparc"));

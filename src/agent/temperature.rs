@@ -10,8 +10,8 @@ pub(in crate::agent) struct Temperature {
     /// ln(alpha).
     pub(in crate::agent) log: f32,
     rate: f32,
-    pub(in crate::agent) moments: [f32; 2],
-    pub(in crate::agent) steps: i32,
+    moments: [f32; 2],
+    steps: i32,
 }
 
 impl Temperature {
@@ -24,18 +24,19 @@ impl Temperature {
         self.log.exp()
     }
 
-    /// Adds the temperature and its optimiser to what is saved.
-    pub(in crate::agent) fn save(&self, state: &mut Weights) {
+    /// Adds the state of the optimiser to what is saved.
+    pub(in crate::agent) fn save_optimiser(&self, state: &mut Weights) {
         let [first, second] = self.moments;
-        state.insert("temperature", vec![self.log, first, second, self.steps as f32], [1, 1, 4]);
+        state.insert("temperature", vec![first, second, self.steps as f32], [1, 1, 3]);
     }
 
-    /// Takes over what [`Temperature::save`] saved.
-    pub(in crate::agent) fn load(&mut self, state: &Weights) -> Result<()> {
-        let &[log, first, second, steps] = state.get_within("temperature", [1, 1, 4], -1e9..=1e9)? else {
-            unreachable!("four numbers")
+    /// Takes over what [`Temperature::save_optimiser`] saved.
+    pub(in crate::agent) fn load_optimiser(&mut self, state: &Weights) -> Result<()> {
+        let &[first, second, steps] = state.get_within("temperature", [1, 1, 3], -1e9..=1e9)? else {
+            unreachable!("three numbers")
         };
-        *self = Self { log, moments: [first, second], steps: steps.max(0.0) as i32, ..*self };
+        self.moments = [first, second];
+        self.steps = steps.max(0.0) as i32;
         Ok(())
     }
 

@@ -269,7 +269,8 @@ impl Checkpoint for Dreamer {
         let [low, high] = self.scale.range();
         state.insert("progress", vec![low, high, self.update_credit], [1, 1, 3]);
         if self.config.behaviour.target_entropy.is_some() {
-            self.temperature.save(&mut state);
+            state.insert("log temperature", vec![self.temperature.log], [1, 1, 1]);
+            self.temperature.save_optimiser(&mut state);
         }
         state.insert_counts("counts", &[self.observed as u64]);
         state.insert_rng("rng", &self.rng);
@@ -284,7 +285,8 @@ impl Checkpoint for Dreamer {
             return Err(Error::Config(format!("the credit of updates is {update_credit}; it must lie in 0..1")));
         }
         if self.config.behaviour.target_entropy.is_some() {
-            self.temperature.load(state)?;
+            self.temperature.log = state.get_within("log temperature", [1, 1, 1], -1e9..=1e9)?[0];
+            self.temperature.load_optimiser(state)?;
             self.networks.behaviour.entropy = self.temperature.alpha();
         }
         state.load_module("target", &mut self.networks.target)?;

@@ -4,7 +4,6 @@ use dfdx::prelude::*;
 
 use super::Sac;
 use crate::agent::decision::{in_decisions, most_observed};
-use crate::agent::temperature::Temperature;
 use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::{MAX_COUNT, Weights};
 use crate::error::Result;
@@ -56,16 +55,13 @@ impl Checkpoint for Sac {
         self.replay.save(&mut state, "replay");
         state.insert_counts("counts", &[self.observed as u64, self.updates as u64]);
         state.insert_rng("rng", &self.rng);
-        let Temperature { moments: [first, second], steps, .. } = self.temperature;
-        state.insert("temperature", vec![first, second, steps as f32], [1, 1, 3]);
+        self.temperature.save_optimiser(&mut state);
         state
     }
 
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
         let rng = state.rng("rng")?;
-        let &[first, second, steps] = state.get_within("temperature", [1, 1, 3], -1e9..=1e9)? else {
-            unreachable!("three numbers")
-        };
+        self.temperature.load_optimiser(state)?;
         state.load_module("target", &mut self.target_critics)?;
         self.policy_optimiser.load(state, "policy", &self.policy)?;
         self.critic_optimiser.load(state, "critics", &self.critics)?;
@@ -73,8 +69,6 @@ impl Checkpoint for Sac {
         let (held, most) = self.replay.pushes().into_inner();
         let most = most_observed(most, self.config.action_repeat);
         let counts = state.counts_within("counts", &[held..=most, 0..=MAX_COUNT])?;
-        self.temperature.moments = [first, second];
-        self.temperature.steps = steps.max(0.0) as i32;
         self.observed = counts[0] as usize;
         self.updates = counts[1] as usize;
         self.rng = rng;
