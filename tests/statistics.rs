@@ -357,15 +357,16 @@ fn presets_of_a_task_agree_on_their_evaluations() {
 fn a_plan_limits_the_budget_of_its_runs() {
     let registry = Registry::standard();
     let quick = StudyPlan::new(&registry, Profile::Quick, "quick".into());
-    let grids = |budget| -> Vec<(usize, usize)> {
+    let grids = |budget| -> Vec<[usize; 4]> {
         let runs = StudyPlan { budget, ..quick.clone() }.runs(&registry).expect("known names");
-        let learning = runs.iter().filter(|(config, _)| config.learns());
-        learning.map(|(config, _)| (config.steps, config.evaluate_every)).collect()
+        let learning = runs.iter().map(|(config, _)| config).filter(|config| config.learns());
+        let grid = |c: &RunConfig| [c.steps, c.evaluate_every, c.evaluation_episodes, c.test_episodes];
+        learning.map(grid).collect()
     };
-    assert_eq!(grids(quick.budget), [(2_000, 500); 8], "four methods, two seeds");
-    let larger = Budget { steps: 100_000, evaluate_every: 1_000 };
-    assert_eq!(grids(Some(larger)), [(3_000, 1_000); 8], "the presets say fewer");
-    assert_eq!(grids(None), [(3_000, 250); 8]);
+    assert_eq!(grids(quick.budget), [[2_000, 500, 10, 50]; 8], "four methods, two seeds");
+    let larger = Budget { steps: 100_000, evaluate_every: 1_000, evaluation_episodes: 300, test_episodes: 300 };
+    assert_eq!(grids(Some(larger)), [[3_000, 1_000, 20, 100]; 8], "the presets say fewer");
+    assert_eq!(grids(None), [[3_000, 250, 20, 100]; 8]);
     let never = StudyPlan { budget: Some(Budget { evaluate_every: 0, ..larger }), ..quick.clone() };
     assert!(never.runs(&registry).is_err_and(|problem| problem.to_string().contains("evaluate_every")));
 }

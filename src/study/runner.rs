@@ -22,13 +22,17 @@ pub enum Profile {
     Full,
 }
 
-/// How long the methods that learn train, if that is less than their presets say.
+/// The size of every run, where that is less than its preset says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Environment steps of a run, at most.
     pub steps: usize,
-    /// Environment steps from one evaluation to the next.
+    /// Environment steps from one evaluation to the next: exactly so many.
     pub evaluate_every: usize,
+    /// Episodes of an evaluation, at most.
+    pub evaluation_episodes: usize,
+    /// Episodes of the test, at most.
+    pub test_episodes: usize,
 }
 
 /// What is compared.
@@ -107,8 +111,11 @@ impl StudyPlan {
         let mut runs = Vec::new();
         for (task, method) in self.tasks.iter().flat_map(|task| self.methods.iter().map(move |method| (task, method))) {
             let mut config = registry.config(task, method, self.seeds.start, None, None)?;
-            if let Some(Budget { steps, evaluate_every }) = self.budget {
-                (config.steps, config.evaluate_every) = (config.steps.min(steps), evaluate_every);
+            if let Some(Budget { steps, evaluate_every, evaluation_episodes, test_episodes }) = self.budget {
+                config.steps = config.steps.min(steps);
+                config.evaluate_every = evaluate_every;
+                config.evaluation_episodes = config.evaluation_episodes.min(evaluation_episodes);
+                config.test_episodes = config.test_episodes.min(test_episodes);
                 config.check()?;
             }
             // Finds out now, not hours later, whether the method can be used for the task.

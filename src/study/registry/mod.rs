@@ -70,7 +70,7 @@ impl Registry {
             &["reach"],
             // The longest runs first, so that no core waits for the last one.
             &["dreamer", "oracle", "pets", "tdmpc2", "sac", "scripted", "random"],
-            Some(Budget { steps: 2_000, evaluate_every: 500 }),
+            Some(Budget { steps: 2_000, evaluate_every: 500, evaluation_episodes: 10, test_episodes: 50 }),
         )
     }
 
