@@ -21,9 +21,14 @@ impl Held {
         self.action.clone()
     }
 
-    /// Drops what is left of it: a new episode begins.
+    /// The action before the next decision: `size` zeros before the first one of an episode.
+    pub fn last(&self, size: usize) -> Vec<f32> {
+        if self.action.is_empty() { vec![0.0; size] } else { self.action.clone() }
+    }
+
+    /// Drops it: a new episode begins.
     pub fn reset(&mut self) {
-        self.left = 0;
+        *self = Self::default();
     }
 }
 

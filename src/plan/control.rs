@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use nalgebra::{RealField, convert};
 use serde::{Deserialize, Serialize};
 
+use super::costs::{ActionCosts, WithCosts};
 use super::{ActionSequences, Iteration, Objective, PlanObserver, Planner, PlannerConfig};
 use crate::rng::Rng;
 use crate::settings::ranges;
@@ -67,6 +68,10 @@ ranges!(ControlConfig {
 });
 
 impl ControlConfig {
+    fn costs(&self) -> ActionCosts {
+        ActionCosts { effort: self.effort_penalty, change: self.change_penalty }
+    }
+
     /// Whether a plan holds what is executed of it.
     pub(crate) fn suits(&self, planner: &PlannerConfig) -> bool {
         self.replan_every <= planner.horizon()
@@ -150,7 +155,8 @@ impl RecedingHorizon {
                 let candidates = &spline.in_control_steps(candidates);
                 observer(&Iteration { index, candidates, returns, mean: &mean });
             };
-            let plan = self.planner.plan(&mut Interpolated { objective, spline }, &mut observe, rng);
+            let mut objective = WithCosts { objective, costs: self.config.costs(), before: &self.last };
+            let plan = self.planner.plan(&mut Interpolated { objective: &mut objective, spline }, &mut observe, rng);
             self.planner.shift(replan_every);
             let executed = plan.actions.get(..replan_every * self.action_size).unwrap_or_else(|| {
                 let numbers = plan.actions.len();
@@ -212,26 +218,6 @@ impl Spline<'_> {
         }
     }
 
-    /// What a sequence of control steps costs, and the derivative with respect to each number, which is added to `slopes`
-    /// with a minus sign.
-    fn penalty(&self, steps: &[f32], slopes: Option<&mut [f32]>) -> f32 {
-        let ControlConfig { effort_penalty, change_penalty, .. } = *self.config;
-        if effort_penalty == 0.0 && change_penalty == 0.0 {
-            return 0.0;
-        }
-        let size = self.start.len();
-        let before = self.start.iter().chain(steps);
-        let changes: Vec<f32> = steps.iter().zip(before).map(|(a, before)| a - before).collect();
-        if let Some(slopes) = slopes {
-            for (i, slope) in slopes.iter_mut().enumerate() {
-                let next = changes.get(i + size).unwrap_or(&0.0);
-                *slope -= 2.0 * (effort_penalty * steps[i] + change_penalty * (changes[i] - next));
-            }
-        }
-        let squares = |values: &[f32]| values.iter().map(|x| x * x).sum::<f32>();
-        effort_penalty * squares(steps) + change_penalty * squares(&changes)
-    }
-
     fn in_control_steps(&self, sequences: &ActionSequences) -> ActionSequences {
         ActionSequences {
             horizon: sequences.horizon * self.config.action_repeat,
@@ -249,18 +235,11 @@ struct Interpolated<'a> {
 
 impl Objective for Interpolated<'_> {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
-        let steps = self.spline.in_control_steps(sequences);
-        let returns = self.objective.returns(&steps);
-        returns.iter().zip(steps.rows()).map(|(total, row)| total - self.spline.penalty(row, None)).collect()
+        self.objective.returns(&self.spline.in_control_steps(sequences))
     }
 
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
-        let steps = self.spline.in_control_steps(sequences);
-        let (mut returns, mut gradients) = self.objective.gradients(&steps);
-        let slopes = gradients.chunks_exact_mut(steps.width());
-        for ((total, slopes), row) in returns.iter_mut().zip(slopes).zip(steps.rows()) {
-            *total -= self.spline.penalty(row, Some(slopes));
-        }
+        let (returns, gradients) = self.objective.gradients(&self.spline.in_control_steps(sequences));
         // By the chain rule: a planned action has a part in the steps that lead to it, and in those that lead from it.
         let ActionSequences { horizon, actions, .. } = *sequences;
         let repeat = self.spline.config.action_repeat;
@@ -320,8 +299,10 @@ mod tests {
                 c.rows().map(|row| row.iter().zip(&weights).map(|(a, w)| a * w).sum()).collect()
             };
             // Central differences of what is quadratic in the actions are exact.
+            let before = [0.1, 0.2];
+            let mut objective = WithCosts { objective: &mut linear, costs: config.costs(), before: &before };
             let mut objective =
-                Interpolated { objective: &mut linear, spline: Spline { config: &config, start: &[0.1, 0.2] } };
+                Interpolated { objective: &mut objective, spline: Spline { config: &config, start: &before } };
             let plans = ActionSequences { horizon: 3, actions: 2, values: vec![0.3, -0.2, 0.1, 0.5, -0.6, 0.4] };
             let (_, gradients) = objective.gradients(&plans);
             for (i, gradient) in gradients.iter().enumerate() {

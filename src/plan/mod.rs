@@ -40,6 +40,7 @@
 mod cem;
 mod config;
 mod control;
+mod costs;
 mod gradient;
 mod guided;
 mod hybrid;
@@ -51,6 +52,7 @@ mod shooting;
 pub use cem::{Cem, CemConfig};
 pub use config::PlannerConfig;
 pub use control::{ControlConfig, Interpolation, RecedingHorizon};
+pub(crate) use costs::{ActionCosts, WithCosts};
 pub use gradient::{Gradient, GradientConfig};
 pub use guided::{GuidedConfig, GuidedMppi};
 pub use hybrid::{Hybrid, HybridConfig};

@@ -90,7 +90,7 @@ impl Checkpoint for TdMpc2 {
         self.scale = RunningScale::new(scale.max(f32::MIN_POSITIVE));
         self.update_credit = update_credit;
         self.rng = own;
-        self.controller = Controller::new(&self.config, &self.spec, planner);
+        self.controller = Controller::explorer(&self.config, &self.spec, planner);
         self.decision.reset();
         self.random.reset();
         Ok(())

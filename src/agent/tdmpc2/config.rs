@@ -34,6 +34,13 @@ pub struct TdMpc2Config {
     /// In evaluations, execute the mean of a plan's last elites instead of one that is drawn from them: more precise, while
     /// exploration keeps the variety of the elites.
     pub evaluate_mean: bool,
+    /// In evaluations, subtracted from a plan's return, times the sum of its squared actions, over decisions.
+    #[doc(alias = "control cost")]
+    pub effort_penalty: f32,
+    /// In evaluations, subtracted from a plan's return, times the sum of the squared changes from one action to the next, over
+    /// decisions, the first from the last executed action: what makes planned motion smooth.
+    #[doc(alias = "smoothness")]
+    pub change_penalty: f32,
     /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
     /// Discount factor gamma, per decision. Without one it follows from the length of an episode:
@@ -85,6 +92,8 @@ impl Default for TdMpc2Config {
             warm_up_noise_beta: 0.0,
             exploration_noise_beta: None,
             evaluate_mean: false,
+            effort_penalty: 0.0,
+            change_penalty: 0.0,
             replay: 1_000_000,
             discount: None,
             n_step: 1,
@@ -119,6 +128,8 @@ ranges!(TdMpc2Config {
     warm_up_noise_beta: 0.0..=10.0,
     exploration_noise_beta: 0.0..=10.0,
     evaluate_mean: Any,
+    effort_penalty: 0.0..=1e6,
+    change_penalty: 0.0..=1e6,
     replay: 2..=100_000_000,
     discount: 0.0..=1.0,
     n_step: 1..=1000,

@@ -15,7 +15,8 @@
 //! dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
 //! observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
 //! action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, another unit of rewards,
-//! n-step targets, coloured noise for exploration, executing the mean of a plan, always or in evaluations.
+//! n-step targets, coloured noise for exploration, executing the mean of a plan, always or in evaluations, and costs of actions in
+//! evaluations.
 
 mod checkpoint;
 mod config;
@@ -154,7 +155,7 @@ impl TdMpc2 {
             random: RandomActions::new(config.warm_up_noise_beta, spec.horizon, spec.action_size),
             decision: Decision::default(),
             frozen: None,
-            controller: Controller::new(&config, spec, rng::stream(seed, "tdmpc2 planner")),
+            controller: Controller::explorer(&config, spec, rng::stream(seed, "tdmpc2 planner")),
             slots: Slots::default(),
             spec: spec.clone(),
             rng,

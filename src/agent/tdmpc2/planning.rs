@@ -6,18 +6,26 @@ use crate::agent::warm_up::RandomActions;
 use crate::env::Spec;
 use crate::model::implicit::{FrozenModel, ImplicitModel, normals};
 use crate::nn::values;
-use crate::plan::{ActionSequences, GuidedMppi, Objective, PlanObserver, Planner};
+use crate::plan::{ActionCosts, ActionSequences, GuidedMppi, Objective, PlanObserver, Planner, WithCosts};
 use crate::rng::{self, Rng};
 
 use rand::RngExt;
 
 /// The return of action sequences from one latent state, and the policy's proposals.
-pub(super) struct LatentReturns<'a> {
-    pub model: &'a FrozenModel,
-    pub z: &'a [f32],
-    pub critics: usize,
-    pub discount: f32,
-    pub rng: Rng,
+struct LatentReturns<'a> {
+    model: &'a FrozenModel,
+    z: Vec<f32>,
+    critics: usize,
+    discount: f32,
+    rng: Rng,
+}
+
+impl<'a> LatentReturns<'a> {
+    fn new(world: Imagined<'a>, obs: &[f32], rng: &mut Rng) -> Self {
+        let Imagined { model, frozen, discount } = world;
+        let z = values(&model.encode(obs)).to_vec();
+        Self { model: frozen, z, critics: model.config().critics, discount, rng: rng::fork(rng) }
+    }
 }
 
 impl Objective for LatentReturns<'_> {
@@ -25,12 +33,12 @@ impl Objective for LatentReturns<'_> {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
         let noise = normals(sequences.count() * sequences.actions, &mut self.rng);
         let pair = two_of(self.critics, &mut self.rng);
-        self.model.returns(self.z, &sequences.values, sequences.horizon, &noise, pair, self.discount)
+        self.model.returns(&self.z, &sequences.values, sequences.horizon, &noise, pair, self.discount)
     }
 
     fn proposals(&mut self, count: usize, like: &ActionSequences) -> ActionSequences {
         let noise = normals(count * like.horizon * like.actions, &mut self.rng);
-        ActionSequences { values: self.model.policy_sequences(self.z, like.horizon, &noise), ..like.clone() }
+        ActionSequences { values: self.model.policy_sequences(&self.z, like.horizon, &noise), ..like.clone() }
     }
 }
 
@@ -57,27 +65,39 @@ pub(super) struct Controller {
     action_repeat: usize,
     /// What it explores with, unless that is white noise.
     noise: Option<RandomActions>,
-    /// Whether it executes the mean of a plan where it does not explore.
-    evaluate_mean: bool,
+    /// Whether it executes the mean of a plan.
+    mean: bool,
+    /// What plans pay for actions.
+    costs: ActionCosts,
     pub rng: Rng,
 }
 
 impl Controller {
-    pub fn new(config: &TdMpc2Config, spec: &Spec, rng: Rng) -> Self {
+    /// The planner that explores.
+    pub fn explorer(config: &TdMpc2Config, spec: &Spec, rng: Rng) -> Self {
         let decisions = spec.horizon.div_ceil(config.action_repeat);
         Self {
             planner: GuidedMppi::new(config.planner.clone(), spec.action_size),
             held: Held::default(),
             action_repeat: config.action_repeat,
             noise: config.exploration_noise_beta.map(|beta| RandomActions::new(beta, decisions, spec.action_size)),
-            evaluate_mean: config.evaluate_mean,
+            mean: false,
+            costs: ActionCosts::default(),
             rng,
         }
     }
 
-    /// The planner of a slot, which depends on nothing but the slot's index.
+    /// The planner of a slot, for evaluations. It depends on nothing but the slot's index.
     pub fn of_slot(config: &TdMpc2Config, spec: &Spec, index: usize) -> Self {
-        Self::new(config, spec, rng::stream(index as u64, "tdmpc2 seat"))
+        Self {
+            mean: config.evaluate_mean,
+            // In the units in which rewards are learned.
+            costs: ActionCosts {
+                effort: config.effort_penalty / config.reward_unit,
+                change: config.change_penalty / config.reward_unit,
+            },
+            ..Self::explorer(config, spec, rng::stream(index as u64, "tdmpc2 seat"))
+        }
     }
 
     #[cfg(test)]
@@ -95,10 +115,12 @@ impl Controller {
     /// The next action from `obs`; plans when the last one has been held long enough. To `explore`, noise of the plan's own
     /// deviation is added.
     pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
-        let Self { planner, held, action_repeat, noise, evaluate_mean, rng } = self;
-        let mean = *evaluate_mean && !explore;
+        let Self { planner, held, action_repeat, noise, mean, costs, rng } = self;
+        let before = held.last(planner.deviation().len());
         held.next(*action_repeat, || {
-            let planned = plan(planner, rng, world, obs, mean, observer);
+            let mut objective = LatentReturns::new(world, obs, rng);
+            let mut objective = WithCosts { objective: &mut objective, costs: *costs, before: &before };
+            let planned = plan(planner, &mut objective, *mean, observer, rng);
             let deviates: Vec<f64> = match noise {
                 _ if !explore => vec![0.0; planned.len()],
                 Some(noise) => noise.deviates(rng).into_iter().map(f64::from).collect(),
@@ -114,17 +136,12 @@ impl Controller {
 /// The first action of a plan, or of its `mean`; the rest of it stays for the next search.
 fn plan(
     planner: &mut GuidedMppi,
-    rng: &mut Rng,
-    world: Imagined,
-    obs: &[f32],
+    objective: &mut dyn Objective,
     mean: bool,
     observer: &mut PlanObserver,
+    rng: &mut Rng,
 ) -> Vec<f32> {
-    let Imagined { model, frozen, discount } = world;
-    let z = model.encode(obs);
-    let critics = model.config().critics;
-    let mut objective = LatentReturns { model: frozen, z: values(&z), critics, discount, rng: rng::fork(rng) };
-    let mut actions = planner.plan(&mut objective, observer, rng).actions;
+    let mut actions = planner.plan(objective, observer, rng).actions;
     if mean {
         actions = planner.mean().iter().map(|a| *a as f32).collect();
     }

@@ -241,6 +241,24 @@ fn the_mean_is_for_evaluations() {
     assert_eq!(planned(&mut drawn), planned(&mut mean));
 }
 
+/// Costs of actions make plans of evaluations smaller and leave exploration alone.
+#[test]
+fn costs_are_for_evaluations() {
+    let spec = Spec::new("seven", [Feature::new("time")], 1, 7, 0.05);
+    let plain = TdMpc2Config { evaluate_mean: true, warm_up: 0, ..TdMpc2Config::default() };
+    let sizes = [
+        plain.clone(),
+        TdMpc2Config { effort_penalty: 100.0, ..plain.clone() },
+        TdMpc2Config { change_penalty: 100.0, ..plain.clone() },
+    ]
+    .map(|config| {
+        let [mut agent, mut free] = [config, plain.clone()].map(|c| TdMpc2::new(&spec, c, 0).expect("usable settings"));
+        assert_eq!(agent.act(&[0.3], Mode::Explore), free.act(&[0.3], Mode::Explore));
+        agent.act(&[0.3], Mode::Evaluate).iter().map(|a| a * a).sum::<f32>()
+    });
+    assert!(sizes[1..].iter().all(|size| *size < 0.5 * sizes[0]), "{sizes:?}");
+}
+
 /// The values that a pair of critics are asked for are never those of one critic twice, and all pairs are drawn.
 #[test]
 fn two_critics_are_two() {
