@@ -65,15 +65,15 @@ fn a_study_of_the_puck_ends_in_a_report() {
     }
 }
 
-/// The oracle plans in the true puck: with the planner's preset it comes to every goal.
+/// The oracle plans in the true puck: with the planner's preset it comes to nearly every goal.
 #[test]
 fn the_oracle_brings_the_puck_home() {
     let registry = registry();
     let config = registry.config("puck", "oracle", 0, None, None).expect("a preset");
     let mut oracle = registry.method(&config).expect("an oracle");
     let mut evaluator = Evaluator::new(|| Ok(Puck::default())).expect("a puck");
-    let summary = evaluator.evaluate(&mut oracle, 10, EvalSeeds::Test).expect("valid actions").summary();
-    assert!(summary.success > 0.85, "{summary:?}");
+    let summary = evaluator.evaluate(&mut oracle, 100, EvalSeeds::Test).expect("valid actions").summary();
+    assert!(summary.success > 0.9, "{summary:?}");
 }
 
 /// What an environment lacks is said by name.
