@@ -22,12 +22,12 @@ pub enum Profile {
     Full,
 }
 
-/// The size of every run, where that is less than its preset says.
+/// The size of every run: limits on what its preset says, and an evaluation interval in place of the preset's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Environment steps of a run, at most.
     pub steps: usize,
-    /// Environment steps from one evaluation to the next: exactly so many.
+    /// Environment steps from one evaluation to the next, whatever the preset says.
     pub evaluate_every: usize,
     /// Episodes of an evaluation, at most.
     pub evaluation_episodes: usize,

@@ -200,8 +200,8 @@ impl Agent for TdMpc2 {
         }
         let (world, controller, slots, fresh) = self.imagined();
         match mode {
-            Mode::Explore => controller.act(world, obs, true, &mut |_| {}),
-            Mode::Evaluate => slots.state(0, fresh).act(world, obs, false, &mut |_| {}),
+            Mode::Explore => controller.act(world, obs, &mut |_| {}),
+            Mode::Evaluate => slots.state(0, fresh).act(world, obs, &mut |_| {}),
         }
     }
 
@@ -209,7 +209,7 @@ impl Agent for TdMpc2 {
         let (world, _, controllers, fresh) = self.imagined();
         let controllers = controllers.states(slots, fresh).into_par_iter();
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
-        controllers.zip(observations).map(|(controller, obs)| controller.act(world, obs, false, &mut |_| {})).collect()
+        controllers.zip(observations).map(|(controller, obs)| controller.act(world, obs, &mut |_| {})).collect()
     }
 
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
@@ -222,7 +222,7 @@ impl Agent for TdMpc2 {
             sequences.splice(0..0, order.iter().flat_map(|&i| iteration.candidates.row(i)).copied());
             returns.splice(0..0, order.iter().map(|&i| iteration.returns[i]));
         };
-        let action = controller.act(world, slot.obs, false, &mut observer);
+        let action = controller.act(world, slot.obs, &mut observer);
         if returns.is_empty() {
             // An action is held; nothing was planned.
             return (action, Vec::new());

@@ -63,8 +63,7 @@ pub(super) struct Controller {
     /// The action that is held.
     pub held: Held,
     action_repeat: usize,
-    /// What it explores with, unless that is white noise.
-    noise: Option<RandomActions>,
+    noise: Noise,
     /// Whether it executes the mean of a plan.
     mean: bool,
     /// What plans pay for actions.
@@ -72,15 +71,35 @@ pub(super) struct Controller {
     pub rng: Rng,
 }
 
+/// The noise that is added to a plan's action, in units of the plan's deviation.
+enum Noise {
+    /// None: an evaluation.
+    Absent,
+    White,
+    Coloured(RandomActions),
+}
+
+impl Noise {
+    /// A number for each component of an action.
+    fn draw(&mut self, components: usize, rng: &mut Rng) -> Vec<f64> {
+        match self {
+            Self::Absent => vec![0.0; components],
+            Self::White => (0..components).map(|_| rng::normal(rng)).collect(),
+            Self::Coloured(actions) => actions.deviates(rng).into_iter().map(f64::from).collect(),
+        }
+    }
+}
+
 impl Controller {
     /// The planner that explores.
     pub fn explorer(config: &TdMpc2Config, spec: &Spec, rng: Rng) -> Self {
         let decisions = spec.horizon.div_ceil(config.action_repeat);
+        let coloured = |beta| Noise::Coloured(RandomActions::new(beta, decisions, spec.action_size));
         Self {
             planner: GuidedMppi::new(config.planner.clone(), spec.action_size),
             held: Held::default(),
             action_repeat: config.action_repeat,
-            noise: config.exploration_noise_beta.map(|beta| RandomActions::new(beta, decisions, spec.action_size)),
+            noise: config.exploration_noise_beta.map_or(Noise::White, coloured),
             mean: false,
             costs: ActionCosts::default(),
             rng,
@@ -90,6 +109,7 @@ impl Controller {
     /// The planner of a slot, for evaluations. It depends on nothing but the slot's index.
     pub fn of_slot(config: &TdMpc2Config, spec: &Spec, index: usize) -> Self {
         Self {
+            noise: Noise::Absent,
             mean: config.evaluate_mean,
             // In the units in which rewards are learned.
             costs: ActionCosts {
@@ -109,24 +129,20 @@ impl Controller {
     pub fn reset(&mut self) {
         self.planner.reset();
         self.held.reset();
-        self.noise.iter_mut().for_each(RandomActions::reset);
+        if let Noise::Coloured(actions) = &mut self.noise {
+            actions.reset();
+        }
     }
 
-    /// The next action from `obs`; plans when the last one has been held long enough. To `explore`, noise of the plan's own
-    /// deviation is added.
-    pub fn act(&mut self, world: Imagined, obs: &[f32], explore: bool, observer: &mut PlanObserver) -> Vec<f32> {
+    /// The next action from `obs`; plans when the last one has been held long enough.
+    pub fn act(&mut self, world: Imagined, obs: &[f32], observer: &mut PlanObserver) -> Vec<f32> {
         let Self { planner, held, action_repeat, noise, mean, costs, rng } = self;
         let before = held.last(planner.deviation().len());
         held.next(*action_repeat, || {
             let mut objective = LatentReturns::new(world, obs, rng);
             let mut objective = WithCosts { objective: &mut objective, costs: *costs, before: &before };
             let planned = plan(planner, &mut objective, *mean, observer, rng);
-            let deviates: Vec<f64> = match noise {
-                _ if !explore => vec![0.0; planned.len()],
-                Some(noise) => noise.deviates(rng).into_iter().map(f64::from).collect(),
-                None => planned.iter().map(|_| rng::normal(rng)).collect(),
-            };
-            let numbers = planned.iter().zip(planner.deviation()).zip(deviates);
+            let numbers = planned.iter().zip(planner.deviation()).zip(noise.draw(planned.len(), rng));
             let action = numbers.map(|((a, std), deviate)| (f64::from(*a) + std * deviate).clamp(-1.0, 1.0) as f32);
             action.collect()
         })

@@ -68,7 +68,8 @@ impl Registry {
         let registry = Self { envs: Vec::new(), agents: Vec::new(), presets, quick_study: QuickStudy::default() };
         agents::register(envs::register(registry)).quick_study(
             &["reach"],
-            // The longest runs first, so that no core waits for the last one, except the oracle, whose search uses all cores.
+            // Runs start in this order. The longest come first, so that the cores finish at about the same time; the oracle, whose
+            // search uses all cores, comes last.
             &["dreamer", "tdmpc2", "pets", "sac", "scripted", "random", "oracle"],
             Some(Budget { steps: 2_000, evaluate_every: 500, evaluation_episodes: 10, test_episodes: 50 }),
         )
