@@ -20,6 +20,10 @@ use handful::study::evaluate::{EvalSeeds, Evaluator};
 use handful::study::registry::Registry;
 use handful::study::run::{Event, Run, is_complete};
 
+/// As in the program.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 /// An episode of learning; its return.
 fn episode(env: &mut World, agent: &mut dyn Agent, seed: u64) -> f32 {
     let (mut obs, mut total) = (env.reset(seed), 0.0);
