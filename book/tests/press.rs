@@ -238,6 +238,14 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     quotes.push(("chapters/06-pets.md", "each succeeds in all of its 100 test episodes after 3,000".into()));
     let sac = 500.0 * first("sac", "success");
     quotes.push(("chapters/12-study.md", format!("SAC succeeded in {sac:.0} of 500 episodes")));
+    let [sac, pets, tdmpc2, dreamer] =
+        ["sac", "pets", "tdmpc2", "dreamer"].map(|method| in_study("quick", "reach", method, "seconds_to_80"));
+    for file in ["README.md", "chapters/12-study.md"] {
+        let seconds = format!(
+            "in the median after {sac:.0} s, PETS after {pets:.0} s, TD-MPC2 after {tdmpc2:.0} s and Dreamer after {dreamer:.0} s"
+        );
+        quotes.push((file, seconds));
+    }
     let median = |method: &str| thousands(reach(method, "steps_to_80"));
     quotes.extend([
         (

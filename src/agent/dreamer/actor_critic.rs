@@ -204,22 +204,30 @@ impl ActorCritic {
 
     /// The actor's loss in one state: the objective of eq. 11, by REINFORCE with the critic as baseline (as in arXiv v2):
     ///
-    /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)])`
+    /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)] - c |mu_t|^2)`
     ///
-    /// with the weight `w_t` and the entropy coefficient eta. Also the entropy; the gradient with respect to the policy's
-    /// head goes into `slope`.
+    /// with the weight `w_t`, the entropy coefficient eta, and, unlike there, a penalty on the mean (`effort_penalty` c). Also the
+    /// entropy; the gradient with respect to the policy's head goes into `slope`.
     #[doc(alias = "policy gradient")]
     #[doc(alias = "entropy bonus")]
     fn reinforce(&self, head: &[f32], actions: &[f32], weight: f32, advantage: f32, slope: &mut [f32]) -> (f32, f32) {
-        let (mut log_density, mut entropy) = (0.0, 0.0);
+        let (mut log_density, mut entropy, mut effort) = (0.0, 0.0, 0.0);
         for (i, action) in actions.iter().enumerate() {
             let normal = self.distribution(head, i);
             log_density += normal.log_density(*action);
             entropy += normal.entropy();
             let [of_mean, of_std] = normal.slopes(*action, -weight * advantage, -weight * self.entropy);
-            (slope[i], slope[self.actions + i]) = (of_mean, of_std);
+            let [cost, of_cost] = self.effort(&normal, weight);
+            effort += cost;
+            (slope[i], slope[self.actions + i]) = (of_mean + of_cost, of_std);
         }
-        (-weight * (log_density * advantage + self.entropy * entropy), entropy)
+        (-weight * (log_density * advantage + self.entropy * entropy) + effort, entropy)
+    }
+
+    /// The penalty on the mean of one component of an action, times a weight, and its derivative with respect to the raw mean.
+    pub(super) fn effort(&self, normal: &BoundedNormal, weight: f32) -> [f32; 2] {
+        let weight = weight * self.config.effort_penalty;
+        [weight * normal.mean * normal.mean, 2.0 * weight * normal.mean * normal.derivatives()[0]]
     }
 
     /// The critic's loss: the two-hot cross-entropies of both `targets` (the lambda-returns, and the target network's values
@@ -272,12 +280,17 @@ mod tests {
         let world = Task::Pendulum.make();
         let mut rng = rng::stream(0, "actor");
         let world = WorldModel::new(world.spec(), &WorldModelConfig::default(), &mut rng);
-        let (actor, _) = ActorCritic::new(&world, 2, &ActorCriticConfig::default(), &mut rng);
+        let (mut actor, _) = ActorCritic::new(&world, 2, &ActorCriticConfig::default(), &mut rng);
         let (head, actions, weight, advantage) = ([0.5, -0.3, 0.2, -1.0], [0.9, -1.4], 0.941_094, 0.864_437_3);
         let mut slope = [0.0; 4];
         let (loss, entropy) = actor.reinforce(&head, &actions, weight, advantage, &mut slope);
         let expected = -f64::from(weight) * (-2.652_197_05 * f64::from(advantage) + 3e-4 * 2.466_678_86);
         assert!((f64::from(loss) - expected).abs() < 1e-5 && (entropy - 2.466_679).abs() < 1e-5, "{loss} {expected}");
+
+        actor.config.effort_penalty = 0.3;
+        let means: f32 = head[..2].iter().map(|raw| raw.tanh() * raw.tanh()).sum();
+        let with_penalty = actor.reinforce(&head, &actions, weight, advantage, &mut slope).0;
+        assert!((with_penalty - loss - weight * 0.3 * means).abs() < 1e-5, "{with_penalty} {loss}");
         for (i, slope) in slope.iter().enumerate() {
             let moved = |by: f32| {
                 let mut head = head;

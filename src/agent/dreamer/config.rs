@@ -145,6 +145,10 @@ pub struct ActorCriticConfig {
     pub target_entropy: Option<f32>,
     /// Step size of the coefficient's logarithm (Adam), with a target entropy.
     pub entropy_rate: f32,
+    /// Weight of the policy's squared mean actions in the actor's loss, in units of the return scale. Where nothing is to be gained
+    /// by moving, for example with a lifted cube, the mean is otherwise arbitrary. The published code has no such term.
+    #[doc(alias = "control cost")]
+    pub effort_penalty: f32,
     /// How the actor learns.
     pub gradient: ActorGradient,
     /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic is
@@ -169,6 +173,7 @@ impl Default for ActorCriticConfig {
             entropy: 3e-4,
             target_entropy: None,
             entropy_rate: 1e-3,
+            effort_penalty: 0.0,
             gradient: ActorGradient::default(),
             center_advantages: false,
             min_std: 0.1,
@@ -186,6 +191,7 @@ ranges!(ActorCriticConfig {
     entropy: 0.0..=1e3,
     target_entropy: -100.0..=100.0,
     entropy_rate: 0.0..=1.0,
+    effort_penalty: 0.0..=1e3,
     gradient: Any,
     center_advantages: Any,
     min_std: 1e-4..=0.999,

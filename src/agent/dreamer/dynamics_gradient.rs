@@ -12,9 +12,9 @@ use crate::rng::{self, Rng};
 impl ActorCritic {
     /// The actor's loss on a rollout that [`ActorCritic::imagine`] drew from `start` with this generator, drawn again on `tape`:
     ///
-    /// `-1/H sum_t w_t (R_t / S + eta H[pi(. | s_t)])`
+    /// `-1/H sum_t w_t (R_t / S + eta H[pi(. | s_t)] - c |mu_t|^2)`
     ///
-    /// with the return scale S and the entropy coefficient eta, as terms for [`ops::total`]. Weights and continuations are under a
+    /// with the return scale S, the entropy coefficient eta and the `effort_penalty` c, as terms for [`ops::total`]. Weights and continuations are under a
     /// stop-gradient, and so are the states that the policy reads. Gradients flow into the world model's parameters, too: only
     /// those of the policy are meant to be used.
     pub(super) fn dynamics_loss<T: Tape<f32, Cpu>>(
@@ -38,9 +38,9 @@ impl ActorCritic {
                     self.reparametrised(head, &noise[row * self.actions..], action, jacobian);
                 })
             });
-            let bonus = |row: usize| -rollout.weights[t][row] * self.entropy;
-            let entropy = tape.rowwise(&head, |row, head, slope| self.entropy(head, bonus(row), slope));
-            losses.push((1.0 / horizon as f32, entropy));
+            let weights = &rollout.weights[t];
+            let regularisers = tape.rowwise(&head, |row, head, slope| self.regularisers(head, weights[row], slope));
+            losses.push((1.0 / horizon as f32, regularisers));
             latent = world.imagine_on(tape, &latent, &action, rng);
             features.push(tape.join(&latent.deter, &latent.stoch));
         }
@@ -68,12 +68,15 @@ impl ActorCritic {
         }
     }
 
-    /// The policy's entropy in one state times a weight; its gradient goes into `slope`.
-    fn entropy(&self, head: &[f32], weight: f32, slope: &mut [f32]) -> f32 {
+    /// The loss of the entropy bonus and of the penalty on the mean in one state, times a weight; its gradient goes into `slope`.
+    fn regularisers(&self, head: &[f32], weight: f32, slope: &mut [f32]) -> f32 {
+        let bonus = -weight * self.entropy;
         let each = (0..self.actions).map(|i| {
             let normal = self.distribution(head, i);
-            [slope[i], slope[self.actions + i]] = normal.slopes(normal.mean, 0.0, weight);
-            weight * normal.entropy()
+            [slope[i], slope[self.actions + i]] = normal.slopes(normal.mean, 0.0, bonus);
+            let [effort, of_effort] = self.effort(&normal, weight);
+            slope[i] += of_effort;
+            bonus * normal.entropy() + effort
         });
         each.sum()
     }
@@ -137,11 +140,12 @@ mod tests {
 
     /// Within [-1, 1]; beyond, actions stay at the limit but pass gradients.
     #[test]
-    fn actions_and_entropies_have_the_slopes_of_differences() {
+    fn actions_and_regularisers_have_the_slopes_of_differences() {
         let env = Task::Pendulum.make();
         let mut rng = rng::stream(0, "actor");
         let world = WorldModel::new(env.spec(), &WorldModelConfig::default(), &mut rng);
-        let (actor, _) = ActorCritic::new(&world, 2, &ActorCriticConfig::default(), &mut rng);
+        let config = ActorCriticConfig { entropy: 0.7, effort_penalty: 0.4, ..ActorCriticConfig::default() };
+        let (actor, _) = ActorCritic::new(&world, 2, &config, &mut rng);
         let (head, noise) = ([0.5, -0.3, 0.2, -1.0], [0.3, -0.7]);
         let action = |head: &[f32], noise: &[f32]| {
             let (mut action, mut jacobian) = ([0.0; 2], [0.0; 8]);
@@ -150,19 +154,19 @@ mod tests {
         };
         let (_, jacobian) = action(&head, &noise);
         let mut slope = [0.0; 4];
-        actor.entropy(&head, 0.7, &mut slope);
+        actor.regularisers(&head, 0.9, &mut slope);
         for k in 0..4 {
             let at = |by: f32| {
                 let mut head = head;
                 head[k] += by;
-                (action(&head, &noise).0, actor.entropy(&head, 0.7, &mut [0.0; 4]))
+                (action(&head, &noise).0, actor.regularisers(&head, 0.9, &mut [0.0; 4]))
             };
             let ((above, more), (below, less)) = (at(1e-2), at(-1e-2));
             for i in 0..2 {
                 let difference = (above[i] - below[i]) / 2e-2;
                 assert!((jacobian[4 * i + k] - difference).abs() < 1e-3, "action {i} by {k}: {difference}");
             }
-            assert!((slope[k] - (more - less) / 2e-2).abs() < 1e-3, "entropy by {k}");
+            assert!((slope[k] - (more - less) / 2e-2).abs() < 1e-3, "regularisers by {k}");
         }
         let (limited, jacobian) = action(&head, &[3.0, 0.0]);
         assert!((limited[0] - 1.0).abs() < 1e-6 && jacobian[0] > 0.0);
