@@ -363,7 +363,7 @@ fn a_plan_limits_the_budget_of_its_runs() {
         let grid = |c: &RunConfig| [c.steps, c.evaluate_every, c.evaluation_episodes, c.test_episodes];
         learning.map(grid).collect()
     };
-    assert_eq!(grids(quick.budget), [[2_000, 500, 10, 50]; 8], "four methods, two seeds");
+    assert_eq!(grids(quick.budget), [[2_000, 500, 10, 20]; 8], "four methods, two seeds");
     let larger = Budget { steps: 100_000, evaluate_every: 1_000, evaluation_episodes: 300, test_episodes: 300 };
     assert_eq!(grids(Some(larger)), [[3_000, 1_000, 20, 100]; 8], "the presets say fewer");
     assert_eq!(grids(None), [[3_000, 250, 20, 100]; 8]);
