@@ -110,14 +110,29 @@ fn in_study(study: &str, task: &str, method: &str, column: &str) -> f64 {
 
 /// The number of successful test episodes of each seed.
 fn test_successes(study: &str, task: &str, method: &str) -> Vec<usize> {
-    let path = root().join("data/study").join(study).join("tests.csv");
-    let table = std::fs::read_to_string(path).expect("a table of tests");
     let mut seeds = std::collections::BTreeMap::new();
-    for row in table.lines().map(|line| line.split(',').collect::<Vec<&str>>()).filter(|row| row[..2] == [task, method])
-    {
-        *seeds.entry(row[2].to_string()).or_default() += usize::from(row[5] == "true");
+    for row in rows(study, "tests.csv", task, method) {
+        *seeds.entry(row[2].clone()).or_default() += usize::from(row[5] == "true");
     }
     seeds.into_values().collect()
+}
+
+/// The rows of a table of a study that are about a method on a task.
+fn rows(study: &str, table: &str, task: &str, method: &str) -> Vec<Vec<String>> {
+    let path = root().join("data/study").join(study).join(table);
+    let table = std::fs::read_to_string(path).expect("a table");
+    let rows = table.lines().map(|line| line.split(',').map(String::from).collect::<Vec<String>>());
+    rows.filter(|row| row[..2] == [task, method]).collect()
+}
+
+/// The open-loop error of a method's model at the end of training, in units of that of predicting no change: the mean of all seeds.
+fn model_error(task: &str, method: &str, steps_ahead: &str) -> f64 {
+    let rows = rows(task, "models.csv", task, method);
+    let step = |row: &Vec<String>| row[3].parse::<usize>().expect("a step");
+    let last = rows.iter().map(step).max().expect("a row");
+    let errors = rows.iter().filter(|row| step(row) == last && row[4] == steps_ahead);
+    let errors: Vec<f64> = errors.map(|row| row[5].parse().expect("an error")).collect();
+    errors.iter().sum::<f64>() / errors.len() as f64
 }
 
 /// README and chapters say what the tables of the studies say.
@@ -188,6 +203,28 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let reaching = ["pets", "sac", "tdmpc2", "dreamer", "pets-learned"].map(|method| lift(method, "seeds_reaching_80"));
     assert_eq!(reaching, [5.0, 5.0, 5.0, 4.0, 0.0]);
     assert_eq!(test_successes("lift", "lift", "dreamer"), [100, 100, 99, 53, 54]);
+    let failures = rows("lift", "tests.csv", "lift", "dreamer").into_iter().filter(|row| row[5] == "false");
+    let returns: Vec<f64> = failures.map(|row| row[4].parse().expect("a return")).collect();
+    let lifted = returns.iter().filter(|earned| **earned > 100.0).count();
+    assert_eq!([lifted, returns.len()], [86, 94]);
+    let [dreamer, tdmpc2] =
+        ["dreamer", "tdmpc2"].map(|method| ["reach", "lift"].map(|task| model_error(task, method, "15")));
+    quotes.extend([
+        (
+            "README.md",
+            format!("are {:.1} and {:.1} times the error of predicting no change", dreamer[0], tdmpc2[0]),
+        ),
+        (
+            "README.md",
+            format!(
+                "On `lift`, they are {:.1} and {:.1} times that error; one step ahead, where little changes, Dreamer's is {:.0} times",
+                dreamer[1],
+                tdmpc2[1],
+                model_error("lift", "dreamer", "1")
+            ),
+        ),
+        ("README.md", format!("whose dynamics have no lasso, is {:.2} on `reach`", model_error("reach", "pets", "15"))),
+    ]);
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| push("pets", column));
     let sparc = ["pets", "sac"].map(|method| push(method, "smoothness_sparc"));

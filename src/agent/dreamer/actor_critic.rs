@@ -206,27 +206,27 @@ impl ActorCritic {
     ///
     /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)] - c |mu_t|^2)`
     ///
-    /// with the weight `w_t`, the entropy coefficient eta, and, unlike there, a penalty on the mean (`effort_penalty` c). Also the
+    /// with the weight `w_t`, the entropy coefficient eta, and, unlike there, a penalty on the mean (`mean_penalty` c). Also the
     /// entropy; the gradient with respect to the policy's head goes into `slope`.
     #[doc(alias = "policy gradient")]
     #[doc(alias = "entropy bonus")]
     fn reinforce(&self, head: &[f32], actions: &[f32], weight: f32, advantage: f32, slope: &mut [f32]) -> (f32, f32) {
-        let (mut log_density, mut entropy, mut effort) = (0.0, 0.0, 0.0);
+        let (mut log_density, mut entropy, mut penalty) = (0.0, 0.0, 0.0);
         for (i, action) in actions.iter().enumerate() {
             let normal = self.distribution(head, i);
             log_density += normal.log_density(*action);
             entropy += normal.entropy();
             let [of_mean, of_std] = normal.slopes(*action, -weight * advantage, -weight * self.entropy);
-            let [cost, of_cost] = self.effort(&normal, weight);
-            effort += cost;
+            let [cost, of_cost] = self.mean_penalty(&normal, weight);
+            penalty += cost;
             (slope[i], slope[self.actions + i]) = (of_mean + of_cost, of_std);
         }
-        (-weight * (log_density * advantage + self.entropy * entropy) + effort, entropy)
+        (-weight * (log_density * advantage + self.entropy * entropy) + penalty, entropy)
     }
 
     /// The penalty on the mean of one component of an action, times a weight, and its derivative with respect to the raw mean.
-    pub(super) fn effort(&self, normal: &BoundedNormal, weight: f32) -> [f32; 2] {
-        let weight = weight * self.config.effort_penalty;
+    pub(super) fn mean_penalty(&self, normal: &BoundedNormal, weight: f32) -> [f32; 2] {
+        let weight = weight * self.config.mean_penalty;
         [weight * normal.mean * normal.mean, 2.0 * weight * normal.mean * normal.derivatives()[0]]
     }
 
@@ -287,7 +287,7 @@ mod tests {
         let expected = -f64::from(weight) * (-2.652_197_05 * f64::from(advantage) + 3e-4 * 2.466_678_86);
         assert!((f64::from(loss) - expected).abs() < 1e-5 && (entropy - 2.466_679).abs() < 1e-5, "{loss} {expected}");
 
-        actor.config.effort_penalty = 0.3;
+        actor.config.mean_penalty = 0.3;
         let means: f32 = head[..2].iter().map(|raw| raw.tanh() * raw.tanh()).sum();
         let with_penalty = actor.reinforce(&head, &actions, weight, advantage, &mut slope).0;
         assert!((with_penalty - loss - weight * 0.3 * means).abs() < 1e-5, "{with_penalty} {loss}");

@@ -148,7 +148,7 @@ pub struct ActorCriticConfig {
     /// Weight of the policy's squared mean actions in the actor's loss, in units of the return scale. Where nothing is to be gained
     /// by moving, for example with a lifted cube, the mean is otherwise arbitrary. The published code has no such term.
     #[doc(alias = "control cost")]
-    pub effort_penalty: f32,
+    pub mean_penalty: f32,
     /// How the actor learns.
     pub gradient: ActorGradient,
     /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic is
@@ -173,7 +173,7 @@ impl Default for ActorCriticConfig {
             entropy: 3e-4,
             target_entropy: None,
             entropy_rate: 1e-3,
-            effort_penalty: 0.0,
+            mean_penalty: 0.0,
             gradient: ActorGradient::default(),
             center_advantages: false,
             min_std: 0.1,
@@ -191,7 +191,7 @@ ranges!(ActorCriticConfig {
     entropy: 0.0..=1e3,
     target_entropy: -100.0..=100.0,
     entropy_rate: 0.0..=1.0,
-    effort_penalty: 0.0..=1e3,
+    mean_penalty: 0.0..=1e3,
     gradient: Any,
     center_advantages: Any,
     min_std: 1e-4..=0.999,

@@ -14,7 +14,7 @@ impl ActorCritic {
     ///
     /// `-1/H sum_t w_t (R_t / S + eta H[pi(. | s_t)] - c |mu_t|^2)`
     ///
-    /// with the return scale S, the entropy coefficient eta and the `effort_penalty` c, as terms for [`ops::total`]. Weights and
+    /// with the return scale S, the entropy coefficient eta and the `mean_penalty` c, as terms for [`ops::total`]. Weights and
     /// continuations are under a stop-gradient, and so are the states that the policy reads. Gradients flow into the world model's
     /// parameters, too: only those of the policy are meant to be used.
     pub(super) fn dynamics_loss<T: Tape<f32, Cpu>>(
@@ -74,9 +74,9 @@ impl ActorCritic {
         let each = (0..self.actions).map(|i| {
             let normal = self.distribution(head, i);
             [slope[i], slope[self.actions + i]] = normal.slopes(normal.mean, 0.0, bonus);
-            let [effort, of_effort] = self.effort(&normal, weight);
-            slope[i] += of_effort;
-            bonus * normal.entropy() + effort
+            let [penalty, of_penalty] = self.mean_penalty(&normal, weight);
+            slope[i] += of_penalty;
+            bonus * normal.entropy() + penalty
         });
         each.sum()
     }
@@ -144,7 +144,7 @@ mod tests {
         let env = Task::Pendulum.make();
         let mut rng = rng::stream(0, "actor");
         let world = WorldModel::new(env.spec(), &WorldModelConfig::default(), &mut rng);
-        let config = ActorCriticConfig { entropy: 0.7, effort_penalty: 0.4, ..ActorCriticConfig::default() };
+        let config = ActorCriticConfig { entropy: 0.7, mean_penalty: 0.4, ..ActorCriticConfig::default() };
         let (actor, _) = ActorCritic::new(&world, 2, &config, &mut rng);
         let (head, noise) = ([0.5, -0.3, 0.2, -1.0], [0.3, -0.7]);
         let action = |head: &[f32], noise: &[f32]| {

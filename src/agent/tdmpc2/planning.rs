@@ -96,27 +96,33 @@ impl Controller {
         let decisions = spec.horizon.div_ceil(config.action_repeat);
         let coloured = |beta| Noise::Coloured(RandomActions::new(beta, decisions, spec.action_size));
         Self {
-            planner: GuidedMppi::new(config.planner.clone(), spec.action_size),
-            held: Held::default(),
-            action_repeat: config.action_repeat,
             noise: config.exploration_noise_beta.map_or(Noise::White, coloured),
-            mean: false,
-            costs: ActionCosts::default(),
-            rng,
+            ..Self::without_noise(config, spec, rng)
         }
     }
 
     /// The planner of a slot, for evaluations. It depends on nothing but the slot's index.
     pub fn of_slot(config: &TdMpc2Config, spec: &Spec, index: usize) -> Self {
         Self {
-            noise: Noise::Absent,
             mean: config.evaluate_mean,
             // In the units in which rewards are learned.
             costs: ActionCosts {
                 effort: config.effort_penalty / config.reward_unit,
                 change: config.change_penalty / config.reward_unit,
             },
-            ..Self::explorer(config, spec, rng::stream(index as u64, "tdmpc2 seat"))
+            ..Self::without_noise(config, spec, rng::stream(index as u64, "tdmpc2 seat"))
+        }
+    }
+
+    fn without_noise(config: &TdMpc2Config, spec: &Spec, rng: Rng) -> Self {
+        Self {
+            planner: GuidedMppi::new(config.planner.clone(), spec.action_size),
+            held: Held::default(),
+            action_repeat: config.action_repeat,
+            noise: Noise::Absent,
+            mean: false,
+            costs: ActionCosts::default(),
+            rng,
         }
     }
 
