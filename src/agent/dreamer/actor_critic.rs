@@ -217,15 +217,18 @@ impl ActorCritic {
             log_density += normal.log_density(*action);
             entropy += normal.entropy();
             let [of_mean, of_std] = normal.slopes(*action, -weight * advantage, -weight * self.entropy);
-            let [cost, of_cost] = self.mean_penalty(&normal, weight);
+            let [cost, of_cost] = self.mean_penalty(i, &normal, weight);
             penalty += cost;
             (slope[i], slope[self.actions + i]) = (of_mean + of_cost, of_std);
         }
         (-weight * (log_density * advantage + self.entropy * entropy) + penalty, entropy)
     }
 
-    /// The penalty on the mean of one component of an action, times a weight, and its derivative with respect to the raw mean.
-    pub(super) fn mean_penalty(&self, normal: &BoundedNormal, weight: f32) -> [f32; 2] {
+    /// The penalty on the mean of component `i` of an action, times a weight, and its derivative with respect to the raw mean.
+    pub(super) fn mean_penalty(&self, i: usize, normal: &BoundedNormal, weight: f32) -> [f32; 2] {
+        if self.config.penalised_components.is_some_and(|components| i >= components) {
+            return [0.0; 2];
+        }
         let weight = weight * self.config.mean_penalty;
         [weight * normal.mean * normal.mean, 2.0 * weight * normal.mean * normal.derivatives()[0]]
     }
@@ -288,17 +291,20 @@ mod tests {
         assert!((f64::from(loss) - expected).abs() < 1e-5 && (entropy - 2.466_679).abs() < 1e-5, "{loss} {expected}");
 
         actor.config.mean_penalty = 0.3;
-        let means: f32 = head[..2].iter().map(|raw| raw.tanh() * raw.tanh()).sum();
-        let with_penalty = actor.reinforce(&head, &actions, weight, advantage, &mut slope).0;
-        assert!((with_penalty - loss - weight * 0.3 * means).abs() < 1e-5, "{with_penalty} {loss}");
-        for (i, slope) in slope.iter().enumerate() {
-            let moved = |by: f32| {
-                let mut head = head;
-                head[i] += by;
-                actor.reinforce(&head, &actions, weight, advantage, &mut [0.0; 4]).0
-            };
-            let difference = (moved(1e-2) - moved(-1e-2)) / 2e-2;
-            assert!((slope - difference).abs() < 1e-3, "{i}: {slope}, {difference} by differences");
+        for (components, penalised) in [(Some(1), 1), (None, 2)] {
+            actor.config.penalised_components = components;
+            let means: f32 = head[..penalised].iter().map(|raw| raw.tanh() * raw.tanh()).sum();
+            let with_penalty = actor.reinforce(&head, &actions, weight, advantage, &mut slope).0;
+            assert!((with_penalty - loss - weight * 0.3 * means).abs() < 1e-5, "{with_penalty} {loss}");
+            for (i, slope) in slope.iter().enumerate() {
+                let moved = |by: f32| {
+                    let mut head = head;
+                    head[i] += by;
+                    actor.reinforce(&head, &actions, weight, advantage, &mut [0.0; 4]).0
+                };
+                let difference = (moved(1e-2) - moved(-1e-2)) / 2e-2;
+                assert!((slope - difference).abs() < 1e-3, "{i}: {slope}, {difference} by differences");
+            }
         }
     }
 }

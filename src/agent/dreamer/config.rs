@@ -146,9 +146,14 @@ pub struct ActorCriticConfig {
     /// Step size of the coefficient's logarithm (Adam), with a target entropy.
     pub entropy_rate: f32,
     /// Weight of the policy's squared mean actions in the actor's loss, in units of the return scale. Where nothing is to be gained
-    /// by moving, for example with a lifted cube, the mean is otherwise arbitrary. The published code has no such term.
+    /// by moving, for example with a lifted cube, the mean is otherwise arbitrary. Soft actor-critic's first code has such a term
+    /// (for the mean before its tanh); the published Dreamer has none.
+    #[doc(alias = "policy_mean_reg_weight")]
     #[doc(alias = "control cost")]
     pub mean_penalty: f32,
+    /// How many components of an action the penalty counts, from the first; all of them if left out. On the arm, the first three move
+    /// the hand. The fourth moves the fingers: with a mean a little below zero, they open slowly, so that what is held falls.
+    pub penalised_components: Option<usize>,
     /// How the actor learns.
     pub gradient: ActorGradient,
     /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic is
@@ -174,6 +179,7 @@ impl Default for ActorCriticConfig {
             target_entropy: None,
             entropy_rate: 1e-3,
             mean_penalty: 0.0,
+            penalised_components: None,
             gradient: ActorGradient::default(),
             center_advantages: false,
             min_std: 0.1,
@@ -192,6 +198,7 @@ ranges!(ActorCriticConfig {
     target_entropy: -100.0..=100.0,
     entropy_rate: 0.0..=1.0,
     mean_penalty: 0.0..=1e3,
+    penalised_components: 1..=4096,
     gradient: Any,
     center_advantages: Any,
     min_std: 1e-4..=0.999,

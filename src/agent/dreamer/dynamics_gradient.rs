@@ -74,7 +74,7 @@ impl ActorCritic {
         let each = (0..self.actions).map(|i| {
             let normal = self.distribution(head, i);
             [slope[i], slope[self.actions + i]] = normal.slopes(normal.mean, 0.0, bonus);
-            let [penalty, of_penalty] = self.mean_penalty(&normal, weight);
+            let [penalty, of_penalty] = self.mean_penalty(i, &normal, weight);
             slope[i] += of_penalty;
             bonus * normal.entropy() + penalty
         });
