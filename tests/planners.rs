@@ -89,9 +89,15 @@ fn a_receding_horizon_plans_only_when_it_is_time() {
 /// The planners that search, each with the distance (largest over all numbers) within which it must come to an
 /// optimum.
 fn planners() -> [(&'static str, PlannerConfig, f32); 4] {
-    let cem = CemConfig { horizon: HORIZON, iterations: 10, ..CemConfig::default() };
-    let icem =
-        IcemConfig { horizon: HORIZON, population: 300, iterations: 8, noise_beta: 1.0, ..IcemConfig::default() };
+    let cem = CemConfig { horizon: HORIZON, population: 800, elites: 80, iterations: 12, ..CemConfig::default() };
+    let icem = IcemConfig {
+        horizon: HORIZON,
+        population: 500,
+        elites: 40,
+        iterations: 15,
+        noise_beta: 1.0,
+        ..IcemConfig::default()
+    };
     let mppi = MppiConfig {
         horizon: HORIZON,
         population: 2000,

@@ -99,13 +99,10 @@ fn the_index_names_what_there_is() {
 
 /// A number in the summary of a study.
 fn in_study(study: &str, task: &str, method: &str, column: &str) -> f64 {
-    let path = root().join("data/study").join(study).join("summary.csv");
-    let table = std::fs::read_to_string(path).expect("a summary");
-    let mut lines = table.lines().map(|line| line.split(',').collect::<Vec<&str>>());
-    let columns = lines.next().expect("a header");
-    let place = columns.iter().position(|name| *name == column).expect("a column");
-    let row = lines.find(|row| row[..2] == [task, method]).expect("a row");
-    row[place].parse().unwrap_or(f64::NAN)
+    // In the header, the columns of the task and the method are called so.
+    let header = &rows(study, "summary.csv", "task", "method")[0];
+    let place = header.iter().position(|name| name == column).expect("a column");
+    rows(study, "summary.csv", task, method)[0][place].parse().unwrap_or(f64::NAN)
 }
 
 /// The number of successful test episodes of each seed.
@@ -125,7 +122,7 @@ fn rows(study: &str, table: &str, task: &str, method: &str) -> Vec<Vec<String>> 
     rows.filter(|row| row[..2] == [task, method]).collect()
 }
 
-/// The open-loop error of a method's model at the end of training, in units of that of predicting no change: the mean of all seeds.
+/// The open-loop error of a method's model in units of that of predicting no change: the mean of its seeds at the last step.
 fn model_error(task: &str, method: &str, steps_ahead: &str) -> f64 {
     let rows = rows(task, "models.csv", task, method);
     let step = |row: &Vec<String>| row[3].parse::<usize>().expect("a step");

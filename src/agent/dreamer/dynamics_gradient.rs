@@ -144,7 +144,12 @@ mod tests {
         let env = Task::Pendulum.make();
         let mut rng = rng::stream(0, "actor");
         let world = WorldModel::new(env.spec(), &WorldModelConfig::default(), &mut rng);
-        let config = ActorCriticConfig { entropy: 0.7, mean_penalty: 0.4, ..ActorCriticConfig::default() };
+        let config = ActorCriticConfig {
+            entropy: 0.7,
+            mean_penalty: 0.4,
+            penalised_components: Some(1),
+            ..ActorCriticConfig::default()
+        };
         let (actor, _) = ActorCritic::new(&world, 2, &config, &mut rng);
         let (head, noise) = ([0.5, -0.3, 0.2, -1.0], [0.3, -0.7]);
         let action = |head: &[f32], noise: &[f32]| {
