@@ -122,14 +122,16 @@ fn rows(study: &str, table: &str, task: &str, method: &str) -> Vec<Vec<String>> 
     rows.filter(|row| row[..2] == [task, method]).collect()
 }
 
-/// The open-loop error of a method's model in units of that of predicting no change: the mean of its seeds at the last step.
+/// The open-loop error of a method's model in units of that of predicting no change: the median of its seeds at the last step.
 fn model_error(task: &str, method: &str, steps_ahead: &str) -> f64 {
     let rows = rows(task, "models.csv", task, method);
     let step = |row: &Vec<String>| row[3].parse::<usize>().expect("a step");
     let last = rows.iter().map(step).max().expect("a row");
     let errors = rows.iter().filter(|row| step(row) == last && row[4] == steps_ahead);
-    let errors: Vec<f64> = errors.map(|row| row[5].parse().expect("an error")).collect();
-    errors.iter().sum::<f64>() / errors.len() as f64
+    let mut errors: Vec<f64> = errors.map(|row| row[5].parse().expect("an error")).collect();
+    errors.sort_by(f64::total_cmp);
+    assert_eq!(errors.len(), 5);
+    errors[2]
 }
 
 /// README and chapters say what the tables of the studies say.
@@ -193,35 +195,34 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let [times, low, high] =
         ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"].map(|column| lift("dreamer", column));
     let needs = format!("SAC needs {times:.1} times as many");
+    let interval = format!("(t interval from {low:.1} to {high:.1})");
     let both = format!("the median seed of PETS is at 80 % by step {}, that of SAC by step {}", by("pets"), by("sac"));
     quotes.extend([
         ("README.md", format!("PETS lifts in {pets} of the test episodes")),
         ("README.md", format!("it lifted in {learned} after 20,000")),
         ("chapters/06-pets.md", both),
-        ("README.md", format!("{needs} steps as Dreamer on `lift`")),
-        ("chapters/10-dreamer.md", format!("{needs} on average (t interval from {low:.1} to {high:.1})")),
+        ("README.md", format!("on `lift`, {needs} steps as Dreamer {interval}")),
+        ("chapters/10-dreamer.md", format!("{needs} on average {interval}")),
         ("chapters/10-dreamer.md", format!("Dreamer lifts in {dreamer} of the test episodes")),
     ]);
     let reaching = ["pets", "sac", "tdmpc2", "dreamer", "pets-learned"].map(|method| lift(method, "seeds_reaching_80"));
     assert_eq!(reaching, [5.0, 5.0, 5.0, 5.0, 0.0]);
     assert_eq!(test_successes("lift", "lift", "dreamer"), [100, 96, 100, 100, 99]);
-    let [dreamer, tdmpc2] =
-        ["dreamer", "tdmpc2"].map(|method| ["reach", "lift"].map(|task| model_error(task, method, "15")));
+    let [dreamer, tdmpc2, pets] =
+        ["dreamer", "tdmpc2", "pets"].map(|method| ["reach", "lift"].map(|task| model_error(task, method, "15")));
     quotes.extend([
         (
             "README.md",
-            format!("are {:.1} and {:.1} times the error of predicting no change", dreamer[0], tdmpc2[0]),
-        ),
-        (
-            "README.md",
             format!(
-                "On `lift`, they are {:.1} and {:.1} times that error; one step ahead, where little changes, Dreamer's is {:.0} times",
+                "are {:.1} and {:.1} times the error of predicting no change on `reach`, and {:.1} and {:.1} times on `lift`; one step ahead on `lift`, where little changes, Dreamer's is {:.0} times",
+                dreamer[0],
+                tdmpc2[0],
                 dreamer[1],
                 tdmpc2[1],
                 model_error("lift", "dreamer", "1")
             ),
         ),
-        ("README.md", format!("whose dynamics have no lasso, is {:.2} on `reach`", model_error("reach", "pets", "15"))),
+        ("README.md", format!("whose dynamics have no lasso, they are {:.2} and {:.1}", pets[0], pets[1])),
     ]);
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
     let [ratio, low] = ["sac_steps_ratio", "sac_steps_ratio_low"].map(|column| push("pets", column));
@@ -259,11 +260,13 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let mean = |method: &str| reach(method, "steps_to_80_restricted_mean");
     let pets = format!("evaluation episodes after {:.0} environment steps, on average over five seeds", mean("pets"));
     let sac = format!(
-        "needs {:.0} on average, {times:.1} times as many (95 % confidence interval of the ratio: {low:.1} to {high:.1})",
+        "needs {:.0} on average, {times:.1} times as many; with five runs each, this factor is uncertain (95 % interval from {low:.1} to {high:.1})",
         mean("sac")
     );
     let [times, low, high] = ratio("tdmpc2");
-    let tdmpc2 = format!("SAC takes {times:.1} times as many steps (t interval from {low:.1} to {high:.1};");
+    let tdmpc2 = format!(
+        "SAC takes {times:.1} times as many steps (`data/study/reach`; t interval from {low:.1} to {high:.1}, bootstrap"
+    );
     let learned = format!("PETS reaches in {} of the test episodes", success("reach", "reach", "pets-learned"));
     quotes.extend([
         ("chapters/00-start.md", pets),
@@ -274,7 +277,17 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     assert_eq!(test_successes("reach", "reach", "pets"), [100; 5]);
     quotes.push(("chapters/06-pets.md", "each succeeds in all of its 100 test episodes after 3,000".into()));
     let sac = 500.0 * first("sac", "success");
-    quotes.push(("chapters/12-study.md", format!("SAC succeeded in {sac:.0} of 500 episodes")));
+    let earlier = |study: &str, method: &str| {
+        let [probability, low, high] = ["earlier_than_sac", "earlier_than_sac_low", "earlier_than_sac_high"]
+            .map(|column| in_study(study, "reach", method, column));
+        format!("with probability {probability:.2} [{low:.2}, {high:.2}]")
+    };
+    quotes.extend([
+        ("chapters/12-study.md", format!("SAC succeeded in {sac:.0} of 500 episodes")),
+        ("chapters/12-study.md", format!("a random seed of SAC {}", earlier("first", "tdmpc2"))),
+        ("chapters/12-study.md", format!("earlier than one of SAC {}", earlier("reach", "pets-learned"))),
+        ("chapters/12-study.md", format!("one of TD-MPC2 {}", earlier("reach", "tdmpc2"))),
+    ]);
     let [sac, pets, tdmpc2, dreamer] =
         ["sac", "pets", "tdmpc2", "dreamer"].map(|method| in_study("quick", "reach", method, "seconds_to_80"));
     for file in ["README.md", "chapters/12-study.md"] {
