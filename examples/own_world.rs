@@ -87,7 +87,7 @@ impl Env for Puck {
     }
 }
 
-/// Without this, PETS learns the reward; without [`Snapshot`], there is no oracle.
+/// Needed by the method `pets`; `pets-learned` works without it. Without [`Snapshot`], there is no oracle.
 impl KnownReward for Puck {
     fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
         1.0 - (2.0 * next_obs[6].hypot(next_obs[7])).tanh()

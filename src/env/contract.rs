@@ -5,6 +5,7 @@
 //!
 //! - the [`Spec`](super::Spec) makes sense ([`Spec::check`](super::Spec::check), asked at every reset);
 //! - observations have [`Spec::observation_size`](super::Spec::observation_size) numbers, all of them finite;
+//! - features are what their [`Role`] says: constant throughout an episode, or a difference of two others;
 //! - rewards are finite;
 //! - the stage is at most the number of [`Spec::stages`](super::Spec::stages);
 //! - episodes end within [`Spec::horizon`](super::Spec::horizon) steps, terminated or truncated;
@@ -28,7 +29,7 @@
 //! assert!(error.contains("the observation at the reset has 2 numbers, the spec names 1"), "{error}");
 //! ```
 
-use super::{Env, Step};
+use super::{Env, Role, Step};
 use crate::error::{Error, Result};
 
 /// An environment whose contract is enforced. See the [module](self) for the rules.
@@ -37,12 +38,27 @@ pub struct Checked<E> {
     env: E,
     /// Steps in this episode; None before the first reset and after the end of an episode.
     elapsed: Option<usize>,
+    /// The features whose values follow from their roles, by index; looked up at every reset.
+    determined: Vec<(usize, Value)>,
 }
+
+/// What a feature has to be, by its role.
+#[derive(Clone, Debug)]
+enum Value {
+    /// What it was at the reset.
+    Constant(f32),
+    /// The difference of two other features, by index.
+    Difference { minuend: usize, subtrahend: usize },
+}
+
+/// How far a feature may be from what its role says, as a fraction of its scale: less than what would mislead a model that relies on
+/// the role.
+const TOLERANCE: f32 = 1e-3;
 
 impl<E: Env> Checked<E> {
     /// The environment, its contract enforced from the next reset on.
     pub fn new(env: E) -> Self {
-        Self { env, elapsed: None }
+        Self { env, elapsed: None, determined: Vec::new() }
     }
 
     /// The environment.
@@ -68,7 +84,10 @@ impl<E: Env> Checked<E> {
         self.elapsed = None;
         self.env.spec().check()?;
         let obs = self.env.reset(seed);
+        self.determined.clear();
         self.check_observation(&obs, "the reset")?;
+        self.determined = self.by_role(&obs);
+        self.check_roles(&obs, "the reset")?;
         self.elapsed = Some(0);
         Ok(obs)
     }
@@ -85,7 +104,9 @@ impl<E: Env> Checked<E> {
         let step = self.env.step(action)?;
         self.elapsed = None;
         let (count, spec) = (elapsed + 1, self.env.spec());
-        self.check_observation(&step.observation, &format!("step {count}"))?;
+        let at = format!("step {count}");
+        self.check_observation(&step.observation, &at)?;
+        self.check_roles(&step.observation, &at)?;
         if !step.reward.is_finite() {
             return self.broken(format!("the reward at step {count} is {}", step.reward));
         }
@@ -115,6 +136,40 @@ impl<E: Env> Checked<E> {
             Some((x, feature)) => self.broken(format!("`{}` in the observation at {at} is {x}", feature.name)),
             None => Ok(()),
         }
+    }
+
+    fn by_role(&self, obs: &[f32]) -> Vec<(usize, Value)> {
+        let features = &self.env.spec().observation;
+        let index = |name: &String| features.iter().position(|feature| feature.name == *name).expect("a checked spec");
+        let value = |i: usize| match &features[i].role {
+            Role::Dynamic => None,
+            Role::Constant => Some(Value::Constant(obs[i])),
+            Role::Difference { minuend, subtrahend } => {
+                Some(Value::Difference { minuend: index(minuend), subtrahend: index(subtrahend) })
+            }
+        };
+        (0..features.len()).filter_map(|i| Some((i, value(i)?))).collect()
+    }
+
+    fn check_roles(&self, obs: &[f32], at: &str) -> Result<()> {
+        let features = &self.env.spec().observation;
+        for (i, value) in &self.determined {
+            let (expected, rounding, why) = match value {
+                Value::Constant(first) => (*first, 0.0, "at the reset, and its role is constant".to_string()),
+                Value::Difference { minuend, subtrahend } => {
+                    let [a, b] = [minuend, subtrahend].map(|part| &features[*part].name);
+                    let [x, y] = [obs[*minuend], obs[*subtrahend]];
+                    let rounding = 2.0 * f32::EPSILON * (x.abs() + y.abs());
+                    (x - y, rounding, format!("as `{a}` minus `{b}`, which its role says it is"))
+                }
+            };
+            let feature = &features[*i];
+            if (obs[*i] - expected).abs() > TOLERANCE * feature.scale + rounding {
+                let (name, x) = (&feature.name, obs[*i]);
+                return self.broken(format!("`{name}` in the observation at {at} is {x}, but {expected} {why}"));
+            }
+        }
+        Ok(())
     }
 
     fn broken<T>(&self, rule: String) -> Result<T> {

@@ -102,6 +102,33 @@ fn the_first_observation_is_checked() {
     }
 }
 
+/// Models copy a constant and recompute a difference, so an observation that contradicts them would mislead every plan.
+#[test]
+fn features_are_what_their_roles_say() {
+    let features = || {
+        let [x, goal] = [Feature::new("x"), Feature::new("goal").constant()];
+        [x, goal, Feature::new("way").difference("goal", "x")]
+    };
+    let env = |first: [f32; 3], then: [f32; 3]| {
+        let spec = Spec::new("scripted", features(), 1, 3, 0.1);
+        let steps = vec![Step::new(then.to_vec(), 0.0)];
+        Checked::new(Scripted { spec, first: first.to_vec(), steps, next: 0 })
+    };
+    let mut in_order = env([0.0, 1.0, 1.0], [0.3, 1.0, 0.7]);
+    in_order.reset(0).expect("in order");
+    in_order.step(&[0.0]).expect("in order");
+    let swapped = rule(env([0.0, 1.0, -1.0], [0.0; 3]).reset(0));
+    assert_eq!(
+        swapped,
+        "`way` in the observation at the reset is -1, but 1 as `goal` minus `x`, which its role says it is"
+    );
+    let mut moving = env([0.0, 1.0, 1.0], [0.0, 1.5, 1.5]);
+    moving.reset(0).expect("in order");
+    let goal = "`goal` in the observation at step 1 is 1.5, but 1 at the reset, and its role is constant";
+    assert_eq!(rule(moving.step(&[0.0])), goal);
+    moving.reset(1).expect("another episode may have another goal");
+}
+
 #[test]
 fn no_step_before_a_reset_or_after_the_end() {
     let expected = "a step before the first reset, or after the end of an episode; reset first";
