@@ -51,6 +51,19 @@ enum Value {
     Difference { minuend: usize, subtrahend: usize },
 }
 
+impl Value {
+    /// What the feature has to be in an observation, and how far rounding may take it from there.
+    fn expected(&self, obs: &[f32]) -> (f32, f32) {
+        match self {
+            Self::Constant(first) => (*first, 0.0),
+            Self::Difference { minuend, subtrahend } => {
+                let [a, b] = [obs[*minuend], obs[*subtrahend]];
+                (a - b, 2.0 * f32::EPSILON * (a.abs() + b.abs()))
+            }
+        }
+    }
+}
+
 /// How far a feature may be from what its role says, as a fraction of its scale: less than what would mislead a model that relies on
 /// the role.
 const TOLERANCE: f32 = 1e-3;
@@ -84,7 +97,6 @@ impl<E: Env> Checked<E> {
         self.elapsed = None;
         self.env.spec().check()?;
         let obs = self.env.reset(seed);
-        self.determined.clear();
         self.check_observation(&obs, "the reset")?;
         self.determined = self.by_role(&obs);
         self.check_roles(&obs, "the reset")?;
@@ -138,6 +150,7 @@ impl<E: Env> Checked<E> {
         }
     }
 
+    /// What the features of an episode that begins with this observation have to be.
     fn by_role(&self, obs: &[f32]) -> Vec<(usize, Value)> {
         let features = &self.env.spec().observation;
         let index = |name: &String| features.iter().position(|feature| feature.name == *name).expect("a checked spec");
@@ -154,18 +167,17 @@ impl<E: Env> Checked<E> {
     fn check_roles(&self, obs: &[f32], at: &str) -> Result<()> {
         let features = &self.env.spec().observation;
         for (i, value) in &self.determined {
-            let (expected, rounding, why) = match value {
-                Value::Constant(first) => (*first, 0.0, "at the reset, and its role is constant".to_string()),
-                Value::Difference { minuend, subtrahend } => {
-                    let [a, b] = [minuend, subtrahend].map(|part| &features[*part].name);
-                    let [x, y] = [obs[*minuend], obs[*subtrahend]];
-                    let rounding = 2.0 * f32::EPSILON * (x.abs() + y.abs());
-                    (x - y, rounding, format!("as `{a}` minus `{b}`, which its role says it is"))
-                }
-            };
-            let feature = &features[*i];
-            if (obs[*i] - expected).abs() > TOLERANCE * feature.scale + rounding {
-                let (name, x) = (&feature.name, obs[*i]);
+            let (x, feature) = (obs[*i], &features[*i]);
+            let (expected, rounding) = value.expected(obs);
+            if (x - expected).abs() > TOLERANCE * feature.scale + rounding {
+                let why = match value {
+                    Value::Constant(_) => "at the reset, and its role is constant".into(),
+                    Value::Difference { minuend, subtrahend } => {
+                        let [a, b] = [minuend, subtrahend].map(|part| &features[*part].name);
+                        format!("as `{a}` minus `{b}`, which its role says it is")
+                    }
+                };
+                let name = &feature.name;
                 return self.broken(format!("`{name}` in the observation at {at} is {x}, but {expected} {why}"));
             }
         }
