@@ -622,5 +622,5 @@ fn trained_agents_that_ship_still_succeed() {
         assert!(summary.success >= 0.7, "{}: {}", folder.display(), summary.success);
         agents += 1;
     }
-    assert_eq!(agents, 10);
+    assert_eq!(agents, 11);
 }
