@@ -99,10 +99,16 @@ fn the_index_names_what_there_is() {
 
 /// A number in the summary of a study.
 fn in_study(study: &str, task: &str, method: &str, column: &str) -> f64 {
-    // In the header, the columns of the task and the method are called so.
-    let header = &rows(study, "summary.csv", "task", "method")[0];
-    let place = header.iter().position(|name| name == column).expect("a column");
-    rows(study, "summary.csv", task, method)[0][place].parse().unwrap_or(f64::NAN)
+    let table = table(study, "summary.csv");
+    let place = table[0].iter().position(|name| name == column).expect("a column");
+    let row = table.iter().find(|row| row[..2] == [task, method]).expect("a row");
+    row[place].parse().unwrap_or(f64::NAN)
+}
+
+/// SAC's steps to 80 % over the method's, and its t interval, in the study of the task.
+fn sac_steps_ratio(task: &str, method: &str) -> [f64; 3] {
+    ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"]
+        .map(|column| in_study(task, task, method, column))
 }
 
 /// The number of successful test episodes of each seed.
@@ -115,11 +121,14 @@ fn test_successes(study: &str, task: &str, method: &str) -> Vec<usize> {
 }
 
 /// The rows of a table of a study that are about a method on a task.
-fn rows(study: &str, table: &str, task: &str, method: &str) -> Vec<Vec<String>> {
-    let path = root().join("data/study").join(study).join(table);
-    let table = std::fs::read_to_string(path).expect("a table");
-    let rows = table.lines().map(|line| line.split(',').map(String::from).collect::<Vec<String>>());
-    rows.filter(|row| row[..2] == [task, method]).collect()
+fn rows(study: &str, name: &str, task: &str, method: &str) -> Vec<Vec<String>> {
+    table(study, name).into_iter().filter(|row| row[..2] == [task, method]).collect()
+}
+
+/// A table of a study, its header first.
+fn table(study: &str, name: &str) -> Vec<Vec<String>> {
+    let table = std::fs::read_to_string(root().join("data/study").join(study).join(name)).expect("a table");
+    table.lines().map(|line| line.split(',').map(String::from).collect()).collect()
 }
 
 /// The open-loop error of a method's model in units of that of predicting no change: the median of its seeds at the last step.
@@ -148,9 +157,8 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         steps if steps < 1000 => steps.to_string(),
         steps => format!("{},{:03}", steps / 1000, steps % 1000),
     };
-    let ratio = |study: &str, method: &str| {
-        let [ratio, low, high] = ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"]
-            .map(|column| in_study(study, study, method, column));
+    let ratio = |task: &str, method: &str| {
+        let [ratio, low, high] = sac_steps_ratio(task, method);
         match method {
             "sac" => "1".into(),
             _ if ratio.is_nan() => "-".into(),
@@ -192,13 +200,12 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     }
     let [pets, learned, dreamer] = ["pets", "pets-learned", "dreamer"].map(|method| success("lift", "lift", method));
     let by = |method: &str| thousands(lift(method, "steps_to_80"));
-    let [times, low, high] =
-        ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"].map(|column| lift("dreamer", column));
+    let [times, low, high] = sac_steps_ratio("lift", "dreamer");
     let needs = format!("SAC needs {times:.1} times as many");
     let interval = format!("(t interval from {low:.1} to {high:.1})");
     let both = format!("the median seed of PETS is at 80 % by step {}, that of SAC by step {}", by("pets"), by("sac"));
     quotes.extend([
-        ("README.md", format!("PETS lifts in {pets} of the test episodes")),
+        ("README.md", format!("On `lift`, PETS succeeds in {pets} of the test episodes")),
         ("README.md", format!("it lifted in {learned} after 20,000")),
         ("chapters/06-pets.md", both),
         ("README.md", format!("on `lift`, {needs} steps as Dreamer {interval}")),
@@ -225,8 +232,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("README.md", format!("whose dynamics have no lasso, they are {:.2} and {:.1}", pets[0], pets[1])),
     ]);
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
-    let [times, low, high] =
-        ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"].map(|column| push("pets", column));
+    let [times, low, high] = sac_steps_ratio("push", "pets");
     let [pets, sac] = ["pets", "sac"].map(|method| push(method, "smoothness_sparc"));
     let [from, to] = ["success_minus_sac_t_low", "success_minus_sac_t_high"].map(|column| 100.0 * push("pets", column));
     let by = |method: &str| thousands(push(method, "steps_to_80"));
@@ -242,7 +248,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         (
             "README.md",
             format!(
-                "PETS pushes in {} of the episodes after 20,000 steps, SAC in {} after 60,000 (t interval of the difference from {from:.0} to {to:.0} percentage points)",
+                "PETS succeeds in {} of the episodes after 20,000 steps, SAC in {} after 60,000 (t interval of the difference from {from:.0} to {to:.0} percentage points)",
                 success("push", "push", "pets"),
                 success("push", "push", "sac")
             ),
@@ -251,21 +257,21 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     ]);
     assert_eq!(["pets", "sac"].map(|method| push(method, "seeds_reaching_80")), [5.0; 2], "all seeds push");
     assert_eq!(test_successes("push", "push", "sac"), [88, 92, 73, 95, 92]);
-    let ratio = |method: &str| {
-        ["sac_steps_ratio", "sac_steps_ratio_t_low", "sac_steps_ratio_t_high"].map(|column| reach(method, column))
-    };
-    let [times, low, high] = ratio("pets");
+    let [times, low, high] = sac_steps_ratio("reach", "pets");
     let mean = |method: &str| reach(method, "steps_to_80_restricted_mean");
     let pets = format!("evaluation episodes after {:.0} environment steps, on average over five seeds", mean("pets"));
     let sac = format!(
         "needs {:.0} on average, {times:.1} times as many; with five runs each, this factor is uncertain (95 % interval from {low:.1} to {high:.1})",
         mean("sac")
     );
-    let [times, low, high] = ratio("tdmpc2");
+    let [times, low, high] = sac_steps_ratio("reach", "tdmpc2");
     let tdmpc2 = format!(
         "SAC takes {times:.1} times as many steps (`data/study/reach`; t interval from {low:.1} to {high:.1}, bootstrap"
     );
-    let learned = format!("PETS reaches in {} of the test episodes", success("reach", "reach", "pets-learned"));
+    let learned = format!(
+        "With a learned reward, PETS succeeds in {} of the test episodes",
+        success("reach", "reach", "pets-learned")
+    );
     quotes.extend([
         ("chapters/00-start.md", pets),
         ("chapters/00-start.md", sac),

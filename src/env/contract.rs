@@ -153,12 +153,12 @@ impl<E: Env> Checked<E> {
     /// What the features of an episode that begins with this observation have to be.
     fn by_role(&self, obs: &[f32]) -> Vec<(usize, Value)> {
         let features = &self.env.spec().observation;
-        let index = |name: &String| features.iter().position(|feature| feature.name == *name).expect("a checked spec");
+        let index_of = |name: &str| self.env.spec().index_of(name).expect("a checked spec");
         let value = |i: usize| match &features[i].role {
             Role::Dynamic => None,
             Role::Constant => Some(Value::Constant(obs[i])),
             Role::Difference { minuend, subtrahend } => {
-                Some(Value::Difference { minuend: index(minuend), subtrahend: index(subtrahend) })
+                Some(Value::Difference { minuend: index_of(minuend), subtrahend: index_of(subtrahend) })
             }
         };
         (0..features.len()).filter_map(|i| Some((i, value(i)?))).collect()

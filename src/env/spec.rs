@@ -163,7 +163,7 @@ impl Spec {
         for Feature { name, role, .. } in &self.observation {
             let Role::Difference { minuend, subtrahend } = role else { continue };
             for part in [minuend, subtrahend] {
-                match self.observation.iter().find(|feature| feature.name == *part) {
+                match self.index_of(part).map(|i| &self.observation[i]) {
                     None => {
                         return refuse(format!("feature `{name}` is a difference of `{part}`, which is no feature"));
                     }
@@ -175,6 +175,11 @@ impl Spec {
             }
         }
         Ok(())
+    }
+
+    /// The place in an observation of the feature with this name.
+    pub fn index_of(&self, name: &str) -> Option<usize> {
+        self.observation.iter().position(|feature| feature.name == name)
     }
 
     /// Dimension of an observation.

@@ -33,16 +33,13 @@ impl FeatureMap {
     /// The feature map of an environment's observations.
     ///
     /// # Errors
-    /// [`Error::Config`] if a difference names a feature that does not exist or is itself a difference, or if no
-    /// feature is dynamic.
+    /// [`Error::Config`] if [`Spec::check`] refuses the specification, or if no feature is dynamic.
     pub fn new(spec: &Spec) -> Result<Self> {
+        spec.check()?;
         let features = &spec.observation;
         let (mut raw, mut predicted, mut differences) = (Vec::new(), Vec::new(), Vec::new());
         let mut near = Vec::new();
-        let find = |name: &str| {
-            let known = features.iter().position(|f| f.name == name && !matches!(f.role, Role::Difference { .. }));
-            known.ok_or_else(|| Error::Config(format!("{}: no feature `{name}` to take a difference of", spec.name)))
-        };
+        let index_of = |name: &str| spec.index_of(name).expect("a checked spec");
         for (i, feature) in features.iter().enumerate() {
             match &feature.role {
                 Role::Dynamic => {
@@ -51,7 +48,7 @@ impl FeatureMap {
                 }
                 Role::Constant => {}
                 Role::Difference { minuend, subtrahend } => {
-                    let (a, b) = (find(minuend)?, find(subtrahend)?);
+                    let (a, b) = (index_of(minuend), index_of(subtrahend));
                     differences.push([i, a, b]);
                     if [a, b].iter().all(|part| features[*part].role == Role::Dynamic) {
                         raw.push(i);

@@ -35,12 +35,11 @@ impl LatentFeatures {
     /// The features of an environment's observations.
     pub fn new(spec: &Spec) -> Self {
         let features = &spec.observation;
-        let index_of = |name: &str| features.iter().position(|feature| feature.name == name);
         let (mut near, mut derived) = (Vec::new(), Vec::<[usize; 3]>::new());
         for (i, feature) in features.iter().enumerate() {
             let Role::Difference { minuend, subtrahend } = &feature.role else { continue };
             near.push(i);
-            if let (Some(minuend), Some(subtrahend)) = (index_of(minuend), index_of(subtrahend))
+            if let (Some(minuend), Some(subtrahend)) = (spec.index_of(minuend), spec.index_of(subtrahend))
                 // Each once, and none that another is derived from.
                 && derived.iter().all(|[index, subtrahend, _]| ![*index, *subtrahend].contains(&minuend))
             {
