@@ -145,7 +145,7 @@ fn oracle(start: usize) -> Result<Episode> {
     let mut oracle = Oracle::new(make, config, start as u64)?;
     Episode::run(start, |_, world, episode| {
         let (clock, before) = (Instant::now(), steps.load(Ordering::Relaxed));
-        let action = oracle.plan(0, &world.snapshot());
+        let action = oracle.plan(0, &world.snapshot()).expect("the world goes on after its time limit");
         let simulated = steps.load(Ordering::Relaxed) - before;
         if simulated > 0 {
             episode.plans += 1;

@@ -38,7 +38,7 @@
 //! enters the command line: train, resume, evaluate, study, report, watch. `examples/own_world.rs` shows all of it.
 //!
 //! ```
-//! use handful::prelude::*;
+//! use handful::{prelude::*, rng};
 //!
 //! /// A point on a line that has to come to zero.
 //! struct Line { spec: Spec, x: f32, elapsed: usize }
@@ -46,7 +46,7 @@
 //! impl Env for Line {
 //!     fn spec(&self) -> &Spec { &self.spec }
 //!     fn reset(&mut self, seed: u64) -> Vec<f32> {
-//!         (self.x, self.elapsed) = (seed as f32 % 3.0 - 1.0, 0);
+//!         (self.x, self.elapsed) = (rng::uniform(&mut rng::stream(seed, "line"), -1.0, 1.0) as f32, 0);
 //!         vec![self.x]
 //!     }
 //!     fn step(&mut self, action: &[f32]) -> Result<Step> {

@@ -23,6 +23,27 @@ fn refused(folder: &Path, args: &[&str], expected: &[&str]) {
     }
 }
 
+/// Only the folders of its runs can restore a study's tables.
+#[test]
+fn a_study_does_not_replace_the_tables_of_another() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let tables = here.join("kept");
+    std::fs::create_dir(&tables).expect("a writable folder");
+    let quick = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/study/quick/tests.csv");
+    std::fs::copy(&quick, tables.join("tests.csv")).expect("a table");
+    let study = |rest: &[&'static str]| [&["study", "--tasks", "pendulum", "--methods", "random"], rest].concat();
+    let other = "holds the tables of another study (with `";
+    refused(here, &study(&["--out", "kept"]), &["kept", other, "choose another --out"]);
+    assert_eq!(std::fs::read_dir(&tables).expect("a folder").count(), 1, "nothing was begun");
+
+    assert!(handful(here, &study(&["--out", "own"])).status.success());
+    let debug = ["study", "--tasks", "pendulum", "--methods", "debug", "--seeds", "1", "--out", "own"];
+    assert!(handful(here, &debug).status.success(), "the folder of the first run is there");
+    std::fs::remove_dir_all(here.join("own/pendulum/debug")).expect("a folder");
+    refused(here, &study(&["--out", "own"]), &["own", other]);
+}
+
 #[test]
 fn bad_input_is_refused_in_one_line() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -80,7 +80,8 @@ fn pets_swings_the_pendulum_up_after_one_random_episode() {
     let mut best = 0.0;
     env.reset(START);
     loop {
-        let outcome = env.step(&oracle.plan(0, &env.snapshot())).expect("a valid action");
+        let action = oracle.plan(0, &env.snapshot()).expect("a plan");
+        let outcome = env.step(&action).expect("a valid action");
         best += outcome.reward;
         if outcome.done() {
             break;
@@ -618,8 +619,12 @@ fn trained_agents_that_ship_still_succeed() {
         let folder = folder.expect("an entry").path();
         let (config, mut method) = registry.trained_method(&folder).expect("a trained agent");
         let mut evaluator = Evaluator::new(|| registry.make_env(&config)).expect("a world");
-        let summary = evaluator.evaluate(&mut method, 10, EvalSeeds::Seed(1)).expect("valid actions").summary();
-        assert!(summary.success >= 0.7, "{}: {}", folder.display(), summary.success);
+        let mut successes = |episodes: usize| {
+            let evaluation = evaluator.evaluate(&mut method, episodes, EvalSeeds::Seed(1)).expect("valid actions");
+            (evaluation.summary().success * episodes as f64).round()
+        };
+        // Seven in the first seven are seven of ten.
+        assert!(successes(7) == 7.0 || successes(10) >= 7.0, "{}", folder.display());
         agents += 1;
     }
     assert_eq!(agents, 11);

@@ -382,7 +382,7 @@ fn a_planner_of_ones_own_enters_pets_and_the_oracle() {
     let oracle = Oracle::new(|| Ok(Task::Pendulum.make()), OracleConfig::default(), 0).expect("usable settings");
     let mut oracle = oracle.with_planner(bang_bang);
     env.reset(0);
-    assert!(extremes(&oracle.plan(0, &env.snapshot())));
+    assert!(extremes(&oracle.plan(0, &env.snapshot()).expect("a plan")));
 
     let ensemble =
         EnsembleConfig { members: 2, elites: 2, hidden: vec![16], first_steps: 50, ..EnsembleConfig::default() };

@@ -1,6 +1,8 @@
 //! Decisions that last several time steps: an action that is held, and the experience of it.
 
 use crate::checkpoint::MAX_COUNT;
+use crate::env::Spec;
+use crate::error::{Error, Result};
 use crate::replay::{Episode, Transition};
 
 /// An action that is held.
@@ -89,6 +91,18 @@ pub(super) fn in_decisions(episode: &Episode, steps: usize) -> Episode {
         rewards: episode.rewards.chunks(steps).take(whole).map(mean).collect(),
         terminated: episode.terminated,
     }
+}
+
+/// # Errors
+/// If the episodes of an environment have fewer than `decisions` decisions of `action_repeat` time steps each: nothing could be learned.
+pub(super) fn check_decisions(agent: &str, spec: &Spec, action_repeat: usize, decisions: usize) -> Result<()> {
+    if spec.horizon / action_repeat >= decisions {
+        return Ok(());
+    }
+    Err(Error::Config(format!(
+        "{agent}.action_repeat: an episode of `{}` has only {} time steps; the agent needs {decisions} decisions of {action_repeat} or more",
+        spec.name, spec.horizon
+    )))
 }
 
 /// The most time steps that an agent can have observed if at most `pushes` entries went into its replay buffer. With held

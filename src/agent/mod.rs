@@ -1,7 +1,7 @@
 //! Agents: the wiring of models, planners and networks behind one small interface.
 //!
 //! [`Agent`] is what a reader of the papers expects: act, observe, update. [`Checkpoint`] and [`Diagnostics`] are traits
-//! beside it, all of whose methods have defaults, so that an agent of one's own is a few lines:
+//! beside it, all of whose methods have defaults, so that a policy of one's own is a few lines:
 //!
 //! ```
 //! use handful::prelude::*;
@@ -47,10 +47,11 @@ pub use sac::{Sac, SacConfig};
 pub use slots::{Slot, Slots};
 pub use tdmpc2::{RunningScale, TdMpc2, TdMpc2Config};
 
+use std::any::Any;
 use std::collections::BTreeMap;
 
 use crate::checkpoint::Weights;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::model::open_loop::OpenLoop;
 use crate::replay::Episode;
 use crate::replay::Transition;
@@ -126,7 +127,7 @@ pub trait Agent: Send {
         None
     }
 
-    /// Actions in several environments side by side, in [`Mode::Evaluate`]. The default asks [`Agent::act`] for each.
+    /// One action for each of several environments side by side, in [`Mode::Evaluate`]. The default asks [`Agent::act`] for each.
     /// Override it to answer in one forward pass, and always if the agent has a memory: it needs one for each slot
     /// ([`Slots`]).
     fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
@@ -136,7 +137,7 @@ pub trait Agent: Send {
     /// The action that [`Agent::act_batch`] would choose in one slot, with some of the imagined trajectories behind it;
     /// none for agents that do not imagine.
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        (self.act_batch(&[*slot]).remove(0), Vec::new())
+        (self.act_batch(&[*slot]).pop().expect("one action for one slot"), Vec::new())
     }
 }
 
@@ -154,7 +155,8 @@ pub trait Policy: Send {
     /// # Errors
     /// As [`Policy::actions`].
     fn explained_action(&mut self, slot: &Slot) -> Result<(Vec<f32>, Vec<ImaginedTrajectory>)> {
-        Ok((self.actions(&[*slot])?.remove(0), Vec::new()))
+        let action = self.actions(&[*slot])?.pop();
+        Ok((action.ok_or_else(|| Error::Config("the policy gave no action for one slot".into()))?, Vec::new()))
     }
 }
 
@@ -168,7 +170,8 @@ impl<A: Agent + ?Sized> Policy for A {
     }
 }
 
-/// What is saved of an agent. The defaults save nothing.
+/// What is saved of an agent. No array may hold NaN. The defaults save nothing, which will do for a policy without state; the run of
+/// an agent that learns and saves nothing can neither be resumed nor used.
 pub trait Checkpoint {
     /// What it has learned, enough to act.
     fn weights(&self) -> Weights {
@@ -226,14 +229,14 @@ pub fn discount_for(decisions: f32) -> f32 {
 }
 
 /// An agent that a run can train, save and diagnose.
-pub trait Learner: Agent + Checkpoint + Diagnostics {}
+pub trait Learner: Agent + Checkpoint + Diagnostics + Any {}
 
-impl<A: Agent + Checkpoint + Diagnostics> Learner for A {}
+impl<A: Agent + Checkpoint + Diagnostics + Any> Learner for A {}
 
 /// A policy that does not learn, but may have a state to save.
-pub trait FixedPolicy: Policy + Checkpoint {}
+pub trait FixedPolicy: Policy + Checkpoint + Any {}
 
-impl<P: Policy + Checkpoint> FixedPolicy for P {}
+impl<P: Policy + Checkpoint + Any> FixedPolicy for P {}
 
 /// What a run carries out and a study compares.
 pub enum Method {
@@ -260,6 +263,15 @@ impl Method {
             Self::Learner(agent) => Some(agent.as_mut()),
             Self::Fixed(_) => None,
         }
+    }
+
+    /// The agent or the policy itself, if it is an `A`.
+    pub fn downcast_ref<A: Any>(&self) -> Option<&A> {
+        let any: &dyn Any = match self {
+            Self::Learner(agent) => agent.as_ref(),
+            Self::Fixed(policy) => policy.as_ref(),
+        };
+        any.downcast_ref()
     }
 
     /// What is saved of it.

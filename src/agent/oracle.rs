@@ -49,7 +49,7 @@ require fits(&[planner.candidates(), planner.horizon(), control.action_repeat]) 
 /// let mut oracle = Oracle::new(|| Ok(Task::Pendulum.make()), OracleConfig::default(), 0)?;
 /// let mut env = Task::Pendulum.make();
 /// env.reset(0);
-/// let action = oracle.plan(0, &env.snapshot());
+/// let action = oracle.plan(0, &env.snapshot())?;
 /// assert_eq!(action.len(), 1);
 /// # Ok::<(), handful::error::Error>(())
 /// ```
@@ -95,15 +95,25 @@ impl<E: Env + Snapshot> Oracle<E> {
     }
 
     /// The action to take in `state`, in the slot `index` (0 if there is one environment only).
-    pub fn plan(&mut self, index: usize, state: &E::State) -> Vec<f32> {
+    ///
+    /// # Errors
+    /// If the environment refuses a step, for example one beyond its time limit.
+    pub fn plan(&mut self, index: usize, state: &E::State) -> Result<Vec<f32>> {
         let Self { config, planner, action_size, controllers, simulators, seed } = self;
         let (controller, rng) = controllers.state(index, |index| {
             let controller = RecedingHorizon::new(planner.make(*action_size), *action_size, &config.control);
             (controller, rng::stream(*seed, &format!("oracle, slot {index}")))
         });
-        let mut objective =
-            |candidates: &ActionSequences| returns(simulators, state, candidates, config.terminal_weight);
-        controller.act(&mut objective, &mut |_| {}, rng)
+        let mut refused = None;
+        let mut objective = |candidates: &ActionSequences| {
+            let returns = returns(simulators, state, candidates, config.terminal_weight);
+            returns.unwrap_or_else(|problem| {
+                refused.get_or_insert(problem);
+                vec![f32::NAN; candidates.count()]
+            })
+        };
+        let action = controller.act(&mut objective, &mut |_| {}, rng);
+        refused.map_or(Ok(action), Err)
     }
 }
 
@@ -114,24 +124,24 @@ impl<E: Env + Snapshot> std::fmt::Debug for Oracle<E> {
 }
 
 /// The return of each sequence from `state` on, the work shared out over the simulators.
+///
+/// # Errors
+/// Any error of a step.
 fn returns<E: Env + Snapshot>(
     simulators: &mut [E],
     state: &E::State,
     candidates: &ActionSequences,
     terminal_weight: f32,
-) -> Vec<f32> {
+) -> Result<Vec<f32>> {
     let share = candidates.count().div_ceil(simulators.len());
     let mut returns = vec![0.0; candidates.count()];
     let shares = returns.par_chunks_mut(share).zip(simulators).enumerate();
-    shares.for_each(|(part, (returns, env))| {
+    shares.try_for_each(|(part, (returns, env))| {
         for (i, total) in returns.iter_mut().enumerate() {
             env.restore(state);
             let mut last = 0.0;
             for action in candidates.row(part * share + i).chunks(candidates.actions) {
-                let Ok(step) = env.step(action) else {
-                    *total = f32::NAN;
-                    break;
-                };
+                let step = env.step(action)?;
                 *total += step.reward;
                 last = step.reward;
                 if step.terminated {
@@ -141,13 +151,14 @@ fn returns<E: Env + Snapshot>(
             }
             *total += terminal_weight * last;
         }
-    });
-    returns
+        Ok(())
+    })?;
+    Ok(returns)
 }
 
 impl<E: Env + Snapshot> Policy for Oracle<E> {
     /// # Errors
-    /// If a slot's environment is not an `E`.
+    /// If a slot's environment is not an `E`, or refuses a step of a plan.
     fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
         let plan = |slot: &Slot| {
             let env = slot.env.downcast_ref::<E>().ok_or_else(|| {
@@ -157,7 +168,7 @@ impl<E: Env + Snapshot> Policy for Oracle<E> {
             if slot.first {
                 self.begin_episode(slot.index);
             }
-            Ok(self.plan(slot.index, &env.snapshot()))
+            self.plan(slot.index, &env.snapshot())
         };
         slots.iter().map(plan).collect()
     }

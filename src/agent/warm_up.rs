@@ -3,6 +3,9 @@
 use crate::plan::noise::ColoredNoise;
 use crate::rng::Rng;
 
+/// The noise of longer episodes is drawn in several pieces: the time that it takes to draw one is quadratic in its length.
+const LONGEST: usize = 1000;
+
 /// Coloured noise, drawn for a whole episode at a time: random actions, or the noise around a policy's actions.
 #[derive(Debug)]
 pub(super) struct RandomActions {
@@ -15,7 +18,7 @@ pub(super) struct RandomActions {
 impl RandomActions {
     /// Noise of exponent `noise_beta` for episodes of `horizon` time steps.
     pub(super) fn new(noise_beta: f64, horizon: usize, action_size: usize) -> Self {
-        Self { noise: ColoredNoise::new(noise_beta, horizon.max(2)), action_size, queue: Vec::new() }
+        Self { noise: ColoredNoise::new(noise_beta, horizon.clamp(2, LONGEST)), action_size, queue: Vec::new() }
     }
 
     /// A new episode begins.

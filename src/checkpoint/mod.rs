@@ -49,13 +49,20 @@ pub struct Weights {
 }
 
 impl Weights {
-    /// Adds an array in row-major order.
+    /// Adds an array in row-major order; whatever had that name is replaced.
     ///
     /// # Panics
     /// If `shape` does not hold as many numbers.
     pub fn insert(&mut self, name: impl Into<String>, numbers: Vec<f32>, shape: [usize; 3]) {
         assert_eq!(numbers.len(), shape.iter().product::<usize>());
-        self.arrays.insert(name.into(), (numbers, shape));
+        let name = name.into();
+        self.counts.remove(&name);
+        self.arrays.insert(name, (numbers, shape));
+    }
+
+    /// Whether there are neither arrays nor whole numbers.
+    pub fn is_empty(&self) -> bool {
+        self.arrays.is_empty() && self.counts.is_empty()
     }
 
     /// The array of that name and shape.
@@ -87,9 +94,11 @@ impl Weights {
         found.map(|(name, _)| name.as_str())
     }
 
-    /// Adds whole numbers, stored as a U64 tensor.
+    /// Adds whole numbers, stored as a U64 tensor; whatever had that name is replaced.
     pub fn insert_counts(&mut self, name: impl Into<String>, counts: &[u64]) {
-        self.counts.insert(name.into(), counts.to_vec());
+        let name = name.into();
+        self.arrays.remove(&name);
+        self.counts.insert(name, counts.to_vec());
     }
 
     /// Reads what [`Weights::insert_counts`] wrote. Also reads older checkpoints, which kept 16 bits of
@@ -167,8 +176,12 @@ impl Weights {
 
     /// Adds all arrays and whole numbers of `other`, with `prefix` before their names. Notes stay behind.
     pub fn absorb(&mut self, prefix: &str, other: &Self) {
-        self.arrays.extend(other.arrays.iter().map(|(name, array)| (format!("{prefix}{name}"), array.clone())));
-        self.counts.extend(other.counts.iter().map(|(name, counts)| (format!("{prefix}{name}"), counts.clone())));
+        for (name, (numbers, shape)) in &other.arrays {
+            self.insert(format!("{prefix}{name}"), numbers.clone(), *shape);
+        }
+        for (name, counts) in &other.counts {
+            self.insert_counts(format!("{prefix}{name}"), counts);
+        }
     }
 
     /// The arrays and whole numbers whose names begin with `prefix`, without it.
@@ -198,6 +211,20 @@ fn outside<T: std::fmt::Debug>(name: &str, value: &T, range: &RangeInclusive<T>)
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A file cannot hold two tensors of one name.
+    #[test]
+    fn a_name_is_given_once() {
+        let mut weights = Weights::default();
+        assert!(weights.is_empty());
+        weights.insert("steps", vec![0.5], [1, 1, 1]);
+        weights.insert_counts("steps", &[7]);
+        assert!(weights.get("steps", [1, 1, 1]).is_err() && weights.count("steps", 0..=9).expect("a count") == 7);
+        let mut other = Weights::default();
+        other.insert("steps", vec![0.25], [1, 1, 1]);
+        weights.absorb("", &other);
+        assert!(weights == other && !weights.is_empty());
+    }
 
     #[test]
     fn what_is_read_lies_in_its_range() {

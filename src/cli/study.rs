@@ -89,6 +89,8 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
         *config = registry.as_begun(config, folder);
         check_run(folder, config)?;
     }
+    #[cfg(feature = "study")]
+    crate::study::tables::check_place(&plan.folder, &runs)?;
     if args.status {
         return answer(report_status(&status(&runs), jobs));
     }

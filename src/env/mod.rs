@@ -117,9 +117,13 @@ pub trait Env: std::any::Any + Send {
 
     /// Starts an episode; the seed fixes everything that is drawn at random in it. Returns the first observation,
     /// [`Spec::observation_size`] numbers.
+    ///
+    /// Use all 64 bits of the seed, for example by [`rng::stream`](crate::rng::stream): seeds of training, evaluations and the test
+    /// differ in their upper bits, and as a `u32` or an `f32` some of them would be equal.
     fn reset(&mut self, seed: u64) -> Vec<f32>;
 
-    /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.
+    /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound. After a truncation, stepping on must be
+    /// possible: plans of the oracle reach beyond the time limit.
     ///
     /// # Errors
     /// [`crate::error::Error::Action`] if the action has the wrong length or is not finite; nothing has moved then.
@@ -216,7 +220,7 @@ pub trait KnownReward {
         true
     }
 
-    /// The reward of reaching `next_obs` from `obs` by `action`.
+    /// The reward of reaching `next_obs` from `obs` by `action`. It is also asked of environments that were never reset.
     fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32;
 
     /// Whether reaching `next_obs` terminates the episode. False by default: most tasks here end by truncation alone.
@@ -264,6 +268,7 @@ pub trait Snapshot {
     /// The current state.
     fn snapshot(&self) -> Self::State;
 
-    /// Goes back to a state that [`Snapshot::snapshot`] of this environment, or of one made alike, has returned.
+    /// Goes back to a state that [`Snapshot::snapshot`] of this environment, or of one made alike, has returned. This environment
+    /// may never have been reset.
     fn restore(&mut self, state: &Self::State);
 }

@@ -32,6 +32,15 @@ impl<E: Env> VectorEnv<E> {
         Self { envs: (0..count).into_par_iter().map(|_| Checked::new(make())).collect() }
     }
 
+    /// The same, if making one can fail.
+    ///
+    /// # Errors
+    /// Any error of `make`.
+    pub fn try_new(count: usize, make: impl Fn() -> Result<E> + Sync) -> Result<Self> {
+        let envs = (0..count).into_par_iter().map(|_| Ok(Checked::new(make()?)));
+        Ok(Self { envs: envs.collect::<Result<_>>()? })
+    }
+
     /// How many there are.
     pub fn len(&self) -> usize {
         self.envs.len()

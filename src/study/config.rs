@@ -51,6 +51,30 @@ pub struct RunConfig {
 /// completed with defaults.
 const VALUES: &str = "values";
 
+/// What no agent can be called, because a configuration or a preset has another entry of that name.
+const RESERVED: [&str; 14] = [
+    VALUES,
+    "task",
+    "method",
+    "seed",
+    "agent",
+    "steps",
+    "evaluate_every",
+    "evaluation_episodes",
+    "test_episodes",
+    "starts",
+    "shake",
+    "env",
+    "for",
+    "base",
+];
+
+/// What is wrong with an agent's name, if it is taken.
+fn reserved(agent: &str) -> Option<String> {
+    let said = || format!("an agent cannot be called `{agent}`: configurations have another entry of that name");
+    RESERVED.contains(&agent).then(said)
+}
+
 fn count_values(table: &Table) -> i64 {
     table.values().map(|value| value.as_table().map_or(1, count_values)).sum()
 }
@@ -108,6 +132,9 @@ impl RunConfig {
     /// From the table that [`RunConfig::to_table`] makes.
     pub(crate) fn from_table(mut table: Table) -> Result<Self, toml::de::Error> {
         let agent = table.get("agent").and_then(Value::as_str).unwrap_or_default().to_string();
+        if let Some(problem) = reserved(&agent) {
+            return Err(serde::de::Error::custom(problem));
+        }
         let settings = match table.remove(&agent) {
             Some(settings) => settings.try_into()?,
             None => Table::new(),
@@ -136,10 +163,13 @@ impl RunConfig {
     }
 
     /// # Errors
-    /// If a name is not an identifier, or a number lies outside its range.
+    /// If a name is not an identifier, the agent has the name of another entry, or a number lies outside its range.
     pub(crate) fn check(&self) -> Result<()> {
         for (what, name) in [("a task", &self.task), ("a method", &self.method), ("an agent", &self.agent)] {
             check_name(what, name)?;
+        }
+        if let Some(problem) = reserved(&self.agent) {
+            return Err(Error::Config(problem));
         }
         check_below("seed", self.seed, LIMIT)?;
         // An evaluation has no more episodes than there are seeds for.
@@ -188,6 +218,9 @@ pub(crate) fn settings_table(settings: &impl Serialize) -> Table {
     toml::from_str(&toml::to_string(settings).expect("settings are TOML")).expect("what was just written can be read")
 }
 
+/// The agents whose settings have had other names.
+const OUR_AGENTS: [&str; 5] = ["pets", "oracle", "dreamer", "tdmpc2", "sac"];
+
 /// Keys that had another name in earlier versions, with the table in which they stand.
 const RENAMED_KEYS: [(&str, &str, &str); 15] = [
     ("pets", "tail", "terminal_weight"),
@@ -207,9 +240,17 @@ const RENAMED_KEYS: [(&str, &str, &str); 15] = [
     ("behaviour", "slow_rate", "target_rate"),
 ];
 
-/// Gives the keys and values of earlier versions the names that they have now.
+/// Gives the keys and values of earlier versions the names that they have now: those of our agents, not of the user's own.
 pub(crate) fn upgrade_keys(table: &mut Table) {
-    upgrade_table("", table);
+    for (name, value) in table.iter_mut() {
+        match value {
+            Value::Table(settings) if OUR_AGENTS.contains(&name.as_str()) => upgrade_table(name, settings),
+            Value::Table(by_task) if name == "for" => {
+                by_task.iter_mut().filter_map(|(_, part)| part.as_table_mut()).for_each(upgrade_keys);
+            }
+            _ => {}
+        }
+    }
 }
 
 fn upgrade_table(name: &str, table: &mut Table) {

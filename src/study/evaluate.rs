@@ -121,13 +121,14 @@ pub struct Evaluator<E> {
 }
 
 impl<E: Env> Evaluator<E> {
-    /// An evaluator with environments made by `make`.
+    /// An evaluator with 20 environments made by `make`.
     ///
     /// # Errors
     /// Any error of `make`, or what is wrong with the environment's spec.
     pub fn new(make: impl Fn() -> Result<E> + Sync) -> Result<Self> {
-        make()?.spec().check()?;
-        Ok(Self { envs: VectorEnv::new(ENVS, || make().expect("what was made once can be made again")) })
+        let envs = VectorEnv::try_new(ENVS, make)?;
+        envs.env(0).spec().check()?;
+        Ok(Self { envs })
     }
 
     /// Lets the policy act in `episodes` episodes with the given seeds.
@@ -190,7 +191,7 @@ impl<E: Env> Evaluator<E> {
             let slot = |&index: &usize| Slot { index, first, obs: &observations[index], env: self.envs.env(index) };
             let slots: Vec<Slot> = running.iter().map(slot).collect();
             let mut actions = vec![None; self.envs.len()];
-            for (&i, action) in running.iter().zip(policy.actions(&slots)?) {
+            for (&i, action) in running.iter().zip(actions_of(policy, &slots)?) {
                 actions[i] = Some(action);
             }
             first = false;
@@ -225,12 +226,25 @@ impl<E: Env> Evaluator<E> {
     }
 }
 
+/// # Errors
+/// Any error of the policy, or if it has not one action for each slot.
+fn actions_of<P: Policy + ?Sized>(policy: &mut P, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
+    let actions = policy.actions(slots)?;
+    if actions.len() != slots.len() {
+        let (given, wanted) = (actions.len(), slots.len());
+        return Err(Error::Config(format!(
+            "the policy gave {given} actions for {wanted} environments; it must give one for each"
+        )));
+    }
+    Ok(actions)
+}
+
 /// Milliseconds that one action takes at the start of an episode: the median of five.
 fn time_of_action<P: Policy + ?Sized>(policy: &mut P, slot: Slot) -> Result<f64> {
     let mut times = [0.0; 5];
     for time in &mut times {
         let start = Instant::now();
-        std::hint::black_box(policy.actions(&[slot])?);
+        std::hint::black_box(actions_of(policy, &[slot])?);
         *time = start.elapsed().as_secs_f64() * 1e3;
     }
     times.sort_by(f64::total_cmp);

@@ -95,8 +95,12 @@ impl RunFolder {
         let progress = state.note("progress").ok_or_else(|| foreign(Error::Config("it tells no progress".into())))?;
         let progress = toml::from_str(progress)
             .map_err(|problem| foreign(Error::Config(format!("its progress: {}", problem.message()))))?;
+        let weights = state.extract("weights.");
+        if config.learns() {
+            check_saved(&weights, &path)?;
+        }
         let checkpoint = method.checkpoint_mut();
-        checkpoint.load_weights(&state.extract("weights.")).map_err(foreign)?;
+        checkpoint.load_weights(&weights).map_err(foreign)?;
         checkpoint.load_training_state(&state).map_err(foreign)?;
         Ok(Some(progress))
     }
@@ -251,8 +255,20 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
         let advice = "the run has saved no weights yet; let it train for longer";
         return Err(Error::Config(format!("{}: {advice}", folder.display())));
     }
-    let loaded = method.checkpoint_mut().load_weights(&read_own(&path, config)?);
+    let weights = read_own(&path, config)?;
+    check_saved(&weights, &path)?;
+    let loaded = method.checkpoint_mut().load_weights(&weights);
     loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))
+}
+
+/// # Errors
+/// If an agent that learns has saved nothing: it could only act as if it had learned nothing.
+fn check_saved(weights: &Weights, path: &Path) -> Result<()> {
+    if weights.is_empty() {
+        let advice = "this agent saves no weights, so its run can neither be resumed nor used; implement its `Checkpoint::weights`";
+        return Err(Error::checkpoint(path, advice, None));
+    }
+    Ok(())
 }
 
 /// Reads a checkpoint or weights, unless they are another run's. (Those of the first edition do not say whose they are.)

@@ -7,15 +7,7 @@
 //! use std::sync::atomic::AtomicBool;
 //!
 //! use handful::prelude::*;
-//! use handful::study::config::RunConfig;
-//! use handful::study::run::Event;
-//! use handful::study::runner::{StudyObserver, StudyPlan, carry_out_all};
-//!
-//! struct Silent;
-//! impl StudyObserver for Silent {
-//!     fn started(&self, _run: usize, _config: &RunConfig, _done: usize) {}
-//!     fn happened(&self, _run: usize, _config: &RunConfig, _done: usize, _event: &Event) {}
-//! }
+//! use handful::study::runner::{StudyPlan, carry_out_all};
 //!
 //! let folder = tempfile::tempdir().expect("a folder");
 //! let plan = StudyPlan {
@@ -27,7 +19,7 @@
 //! };
 //! let registry = Registry::standard();
 //! let runs = plan.runs(&registry)?;
-//! carry_out_all(&registry, &runs, 2, &Silent, &AtomicBool::new(false))?;
+//! carry_out_all(&registry, &runs, 2, &(), &AtomicBool::new(false))?;
 //! # #[cfg(feature = "study")]
 //! # {
 //! let tables = handful::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;

@@ -56,7 +56,7 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     let tuning = tables.starts()? == Starts::Development;
     let tuned = if tuning { vec!["these are development starts".into()] } else { Vec::new() };
     item("the test has starts of its own, which serve neither development nor training nor the curves", &tuned);
-    item("one version of the program, with its sources committed, made all runs", &versions(&tables.runs()?));
+    item("one version of the library, with its sources committed, made all runs", &versions(&tables.runs()?));
     Ok(text
         + "\nRuns that do not reach the level count as right-censored. What the tables cannot tell: on which starts and seeds the settings were \
            chosen, and with how many trials for each method.\n")

@@ -239,14 +239,17 @@ impl<E: Env> Run<E> {
     /// present episode anew.
     ///
     /// # Errors
-    /// If weights are NaN, or a file cannot be written; what was written before is then still there.
+    /// If weights or the training state hold NaN, or a file cannot be written; what was written before is then still there.
     pub fn save(&mut self) -> Result<()> {
         self.progress.seconds += self.clock.elapsed().as_secs_f64();
         self.clock = Instant::now();
         let checkpoint = self.method.checkpoint();
         let weights = checkpoint.weights();
+        let training_state = checkpoint.training_state();
+        // A checkpoint with NaN in it cannot be read.
         check_weights(&weights, self.progress.step)?;
-        self.folder.save(&self.config, weights, checkpoint.training_state(), &self.progress)?;
+        check_numbers("the training state's", &training_state, self.progress.step)?;
+        self.folder.save(&self.config, weights, training_state, &self.progress)?;
         (self.last_save, self.saving) = (Instant::now(), self.clock.elapsed());
         Ok(())
     }
@@ -255,8 +258,12 @@ impl<E: Env> Run<E> {
 /// # Errors
 /// If an array holds NaN: nothing can be learned from there on, and no plan or action is worth anything.
 fn check_weights(weights: &Weights, step: usize) -> Result<()> {
-    match weights.with_nan() {
-        Some(name) => Err(Error::Diverged { what: format!("a weight of `{name}`"), step }),
+    check_numbers("a weight of", weights, step)
+}
+
+fn check_numbers(what: &str, arrays: &Weights, step: usize) -> Result<()> {
+    match arrays.with_nan() {
+        Some(name) => Err(Error::Diverged { what: format!("{what} `{name}`"), step }),
         None => Ok(()),
     }
 }

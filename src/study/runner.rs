@@ -130,13 +130,15 @@ impl StudyPlan {
     }
 }
 
-/// Receives the progress of the runs. Calls come from several threads.
+/// Receives the progress of the runs; `&()` ignores it. Calls come from several threads.
 pub trait StudyObserver: Sync {
     /// A run begins, or goes on after `done` steps.
-    fn started(&self, run: usize, config: &RunConfig, done: usize);
+    fn started(&self, _run: usize, _config: &RunConfig, _done: usize) {}
     /// Something happened in a run, after `done` environment steps.
-    fn happened(&self, run: usize, config: &RunConfig, done: usize, event: &Event);
+    fn happened(&self, _run: usize, _config: &RunConfig, _done: usize, _event: &Event) {}
 }
+
+impl StudyObserver for () {}
 
 /// Carries one run to its end, or until `stop` is set: then the present episode is finished, the run is
 /// saved, and [`Error::Interrupted`] is returned.

@@ -3,9 +3,6 @@
 use super::tables::{BASELINE, LEVEL, Tables};
 use crate::error::Result;
 
-/// The methods of this crate that plan with the reward as a function; the others have only the rewards that they receive.
-pub(super) const TOLD_THE_REWARD: [&str; 2] = ["oracle", "pets"];
-
 /// For each task, which methods are better than the baseline and which are not, as far as intervals tell.
 ///
 /// # Errors
@@ -49,16 +46,21 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
     let Some((steps, first)) = earliest(&medians) else {
         return Ok(format!("no method reaches {level:.0} % success in its median seed."));
     };
-    let told = |method: &str| TOLD_THE_REWARD.contains(&method);
+    let mut informed = Vec::new();
+    for (_, method) in &medians {
+        if tables.is_told_the_reward(method)? {
+            informed.push(*method);
+        }
+    }
     let mut text = format!("{} first at {level:.0} % success, by step {steps:.0} (median).", are(&first));
-    let informed: Vec<&str> = first.iter().copied().filter(|method| told(method)).collect();
-    if informed.is_empty() {
+    let told: Vec<&str> = first.iter().copied().filter(|method| informed.contains(method)).collect();
+    if told.is_empty() {
         return Ok(text);
     }
-    text += &format!(" {} told the reward function", are(&informed));
-    medians.retain(|(_, method)| !told(method));
+    text += &format!(" {} told the reward function", are(&told));
+    medians.retain(|(_, method)| !informed.contains(method));
     text += &match earliest(&medians) {
-        _ if informed.len() < first.len() => ".".into(),
+        _ if told.len() < first.len() => ".".into(),
         Some((steps, first)) => format!("; of the methods that are not, {} first, by step {steps:.0}.", are(&first)),
         None => "; no method that is not gets there in its median seed.".into(),
     };

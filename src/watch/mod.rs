@@ -21,7 +21,7 @@ use crate::env::Env;
 use crate::env::arm::{Pose, Primitive, PrimitiveKind};
 use crate::env::contract::Checked;
 use crate::env::scene::{Body, Camera};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::files;
 
 const PAGE: &str = include_str!("viewer.html");
@@ -99,16 +99,18 @@ impl Recording {
         env.spec().check()?;
         let mut env = Checked::new(env);
         let mut obs = env.reset(seed)?;
-        let bodies = env.env().scene().iter().map(drawn).collect();
+        let bodies: Vec<DrawnBody> = env.env().scene().iter().map(drawn).collect();
         let rest = vec![0.0; env.env().spec().action_size];
-        let mut frames = vec![Frame { poses: poses(env.env()), reward: 0.0, success: false, action: rest }];
+        let mut frames =
+            vec![Frame { poses: poses(env.env(), bodies.len())?, reward: 0.0, success: false, action: rest }];
         let mut paths = Vec::new();
         loop {
             let slot = Slot { index, ..Slot::single(frames.len() == 1, &obs, env.env()) };
             let (action, trajectories) = policy.explained_action(&slot)?;
             paths.push(drawn_trajectories(env.env(), &trajectories));
             let step = env.step(&action)?;
-            frames.push(Frame { poses: poses(env.env()), reward: step.reward, success: step.success, action });
+            let poses = poses(env.env(), bodies.len())?;
+            frames.push(Frame { poses, reward: step.reward, success: step.success, action });
             if step.done() {
                 break;
             }
@@ -205,8 +207,18 @@ fn drawn_trajectories(env: &impl Env, trajectories: &[ImaginedTrajectory]) -> Ve
     drawn.filter(|path| path.points.iter().flatten().all(|x| x.is_finite())).collect()
 }
 
-fn poses(env: &impl Env) -> Vec<[f64; 7]> {
-    env.poses().iter().map(numbers).collect()
+/// # Errors
+/// If there is not one finite pose for each of `bodies` bodies.
+fn poses(env: &impl Env, bodies: usize) -> Result<Vec<[f64; 7]>> {
+    let poses: Vec<[f64; 7]> = env.poses().iter().map(numbers).collect();
+    let broken = |rule: String| Err(Error::Contract { env: env.spec().name.clone(), rule });
+    if poses.len() != bodies {
+        return broken(format!("`scene` has {bodies} bodies, `poses` has {}; they must be as many", poses.len()));
+    }
+    match poses.iter().position(|pose| pose.iter().any(|x| !x.is_finite())) {
+        Some(body) => broken(format!("the pose of body {body} is not finite")),
+        None => Ok(poses),
+    }
 }
 
 fn numbers(pose: &Pose) -> [f64; 7] {

@@ -9,7 +9,7 @@ use handful::checkpoint::Weights;
 use handful::prelude::*;
 use handful::study::config::RunConfig;
 use handful::study::run::{Event, Run, is_complete};
-use handful::study::runner::{StudyObserver, carry_out_all};
+use handful::study::runner::carry_out_all;
 use handful::study::status::{RunState, status};
 use handful::study::tables::Tables;
 use proptest::prelude::*;
@@ -134,7 +134,7 @@ fn a_complete_run_of_an_earlier_version_is_left_alone() {
     let before = summary();
     assert!(before.contains(version) && !is_complete(here, &config), "the configurations differ: {before}");
     let runs = [(config.clone(), here.to_path_buf())];
-    let carry_out = || carry_out_all(&registry(), &runs, 1, &Silent, &AtomicBool::new(false)).expect("a healthy run");
+    let carry_out = || carry_out_all(&registry(), &runs, 1, &(), &AtomicBool::new(false)).expect("a healthy run");
     carry_out();
     assert_eq!(summary(), before);
     // What is written anew is still what that version made.
@@ -142,13 +142,6 @@ fn a_complete_run_of_an_earlier_version_is_left_alone() {
     fs::remove_file(here.join(STATE)).expect("a writable folder");
     carry_out();
     assert_eq!(summary(), before);
-}
-
-struct Silent;
-
-impl StudyObserver for Silent {
-    fn started(&self, _: usize, _: &RunConfig, _: usize) {}
-    fn happened(&self, _: usize, _: &RunConfig, _: usize, _: &Event) {}
 }
 
 /// A study writes anew what a finished run has lost, without training again.
@@ -179,7 +172,7 @@ fn what_a_finished_run_lost_comes_back() {
             // What a kill in the middle of a write leaves behind.
             fs::write(here.join("checkpoint/.handful-a1B2c3"), "half").expect("a writable folder");
             assert!(!is_complete(here, &config), "{file}");
-            carry_out_all(&registry(), &runs, 1, &Silent, &AtomicBool::new(false)).expect("a healthy run");
+            carry_out_all(&registry(), &runs, 1, &(), &AtomicBool::new(false)).expect("a healthy run");
             assert!(is_complete(here, &config) && fs::read(here.join(file)).expect(file) == whole, "{file}");
             assert!(!here.join("checkpoint/.handful-a1B2c3").exists());
         }

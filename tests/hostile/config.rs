@@ -84,6 +84,7 @@ pub(super) const SMALL: [(&str, &str); 6] = [
          evaluation_episodes = 1
          env.horizon = 5
          [tdmpc2]
+         horizon = 2
          batch = 2
          warm_up = 10
          exploration_noise_beta = 1.0

@@ -262,3 +262,21 @@ fn the_program_says_what_a_report_is_without() {
         assert!(expected.iter().all(|part| said.contains(part)), "{args:?}: {said}");
     }
 }
+
+/// A world may have no success, only a return.
+#[test]
+fn a_task_without_success_is_drawn_by_its_return() {
+    for (by_return, what) in [(false, "success rate"), (true, "return")] {
+        let folder = study(&ALL, "test");
+        edit(&folder, "evaluations.csv", |text| {
+            let text = text.replace("episodes,success\n", "episodes,success,return_mean\n");
+            text.replace(",20,0.5\n", if by_return { ",20,0,-1.5\n" } else { ",20,0.5,-1.5\n" })
+        });
+        let text =
+            report::write(folder.path(), folder.path()).map(|_| fs::read_to_string(folder.path().join("report.md")));
+        let text = text.expect("a report").expect("a file");
+        assert_eq!(text.contains("Return (no evaluation succeeds) over environment steps"), by_return);
+        let figure = fs::read_to_string(folder.path().join("pole-learning.svg")).expect("a figure");
+        assert!(figure.contains(&format!("pole: {what}")), "{figure}");
+    }
+}

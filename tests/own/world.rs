@@ -4,21 +4,16 @@
 #[allow(dead_code)] // its `main`
 mod own_world;
 
+use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
+use handful::checkpoint::Weights;
 use handful::prelude::*;
-use handful::study::config::RunConfig;
 use handful::study::run::Event;
-use handful::study::runner::{StudyObserver, StudyPlan, carry_out_all};
+use handful::study::runner::{StudyPlan, carry_out_all};
 use handful::watch::Recording;
 use own_world::{Puck, registry};
-
-struct Silent;
-
-impl StudyObserver for Silent {
-    fn started(&self, _run: usize, _config: &RunConfig, _done: usize) {}
-    fn happened(&self, _run: usize, _config: &RunConfig, _done: usize, _event: &Event) {}
-}
 
 /// The whole protocol in small: five methods train on the puck, are tested, compared and drawn.
 #[test]
@@ -47,7 +42,7 @@ fn a_study_of_the_puck_ends_in_a_report() {
         folder: folder.path().into(),
     };
     let runs = plan.runs(&registry).expect("known names");
-    carry_out_all(&registry, &runs, 2, &Silent, &AtomicBool::new(false)).expect("healthy runs");
+    carry_out_all(&registry, &runs, 2, &(), &AtomicBool::new(false)).expect("healthy runs");
     let learned = folder.path().join("puck/pets-learned/seed0");
     let (config, mut method) = registry.trained_method(&learned).expect("a complete run");
     assert_eq!(config.steps, 500);
@@ -59,6 +54,9 @@ fn a_study_of_the_puck_ends_in_a_report() {
         let folders = runs.iter().map(|(_, folder)| folder.as_path());
         let tables = handful::study::tables::Tables::gather(folders).expect("the runs' tables");
         tables.write(folder.path()).expect("a writable folder");
+        for (method, told) in [("pets", true), ("pets-learned", false), ("dreamer", false), ("sac", false)] {
+            assert_eq!(tables.is_told_the_reward(method).expect("configurations"), told, "{method}");
+        }
         let text = handful::study::report::write(folder.path(), folder.path()).expect("a report");
         assert!(text.contains("puck") && text.contains("pets-learned"), "{text}");
         assert!(folder.path().join("puck-learning.svg").exists());
@@ -142,7 +140,7 @@ fn a_broken_contract_is_told_and_nothing_is_lost() {
         .preset("small", sac);
     let config = registry.config("broken", "small", 0, None, None).expect("a preset");
     let run = [(config, folder.path().join("run"))];
-    let problem = carry_out_all(&registry, &run, 1, &Silent, &AtomicBool::new(false)).expect_err("it is broken");
+    let problem = carry_out_all(&registry, &run, 1, &(), &AtomicBool::new(false)).expect_err("it is broken");
     assert!(matches!(problem, Error::Contract { .. }), "{problem}");
     assert!(problem.to_string().contains("reward"), "{problem}");
     let episodes = std::fs::read_to_string(run[0].1.join("episodes.csv")).expect("the episodes before");
@@ -150,35 +148,178 @@ fn a_broken_contract_is_told_and_nothing_is_lost() {
     assert!(run[0].1.join("weights.safetensors").exists());
 }
 
-/// An agent of one's own is a few lines, and enters the protocol by name.
+/// Repeats the action that earned most.
+struct Copycat {
+    best: (f32, Vec<f32>),
+    rng: handful::rng::Rng,
+    /// Whether it saves anything.
+    saves: bool,
+}
+
+impl Agent for Copycat {
+    fn act(&mut self, _obs: &[f32], mode: Mode) -> Vec<f32> {
+        let noise = |_| handful::rng::uniform(&mut self.rng, -1.0, 1.0) as f32;
+        if mode == Mode::Evaluate { self.best.1.clone() } else { (0..2).map(noise).collect() }
+    }
+
+    fn observe(&mut self, transition: &Transition) {
+        if transition.reward > self.best.0 {
+            self.best = (transition.reward, transition.action.clone());
+        }
+    }
+}
+
+impl Checkpoint for Copycat {
+    fn weights(&self) -> Weights {
+        let mut weights = Weights::default();
+        if self.saves {
+            let (reward, action) = &self.best;
+            weights.insert("reward", vec![*reward], [1, 1, 1]);
+            weights.insert("action", action.clone(), [1, 1, action.len()]);
+        }
+        weights
+    }
+
+    fn load_weights(&mut self, weights: &Weights) -> Result<()> {
+        let (reward, action) = &mut self.best;
+        *reward = weights.get("reward", [1, 1, 1])?[0];
+        *action = weights.get("action", [1, 1, action.len()])?.to_vec();
+        Ok(())
+    }
+
+    fn training_state(&self) -> Weights {
+        let mut state = Weights::default();
+        state.insert_rng("rng", &self.rng);
+        state
+    }
+
+    fn load_training_state(&mut self, state: &Weights) -> Result<()> {
+        self.rng = state.rng("rng")?;
+        Ok(())
+    }
+}
+
+impl Diagnostics for Copycat {}
+
+/// With the agent `copycat`, which saves what it has learned or not.
+fn with_copycat(saves: bool) -> Registry {
+    registry().agent("copycat", move |context, _: NoOptions| {
+        let best = (f32::NEG_INFINITY, vec![0.0; context.spec.action_size]);
+        Ok(Copycat { best, rng: handful::rng::stream(context.seed, "copycat"), saves })
+    })
+}
+
+/// An agent of one's own is a few lines, and enters the protocol by name: it is trained, resumed and used.
 #[test]
 fn an_agent_of_ones_own_is_trained_by_name() {
-    /// Repeats the action that earned most.
-    struct Copycat {
-        best: (f32, Vec<f32>),
-        rng: handful::rng::Rng,
+    let registry = with_copycat(true);
+    let folders = [tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder")];
+    let [whole, resumed] = folders.each_ref().map(|folder| folder.path());
+    let config = registry.config("puck", "copycat", 0, Some(100), None).expect("a method of its own name");
+    let to_the_end = |folder: &Path| {
+        let mut run = registry.open_run(&config, folder).expect("a run");
+        while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
+    };
+    to_the_end(whole);
+    let mut run = registry.open_run(&config, resumed).expect("a new run");
+    while run.steps_done() < 50 {
+        run.step().expect("a healthy run");
     }
-    impl Agent for Copycat {
-        fn act(&mut self, _obs: &[f32], mode: Mode) -> Vec<f32> {
-            let noise = |_| handful::rng::uniform(&mut self.rng, -1.0, 1.0) as f32;
-            if mode == Mode::Evaluate { self.best.1.clone() } else { (0..2).map(noise).collect() }
-        }
-        fn observe(&mut self, transition: &Transition) {
-            if transition.reward > self.best.0 {
-                self.best = (transition.reward, transition.action.clone());
-            }
-        }
+    run.save().expect("a writable folder");
+    drop(run);
+    to_the_end(resumed);
+    for file in ["weights.safetensors", "episodes.csv", "test.csv"] {
+        assert!(whole.join(file).exists());
     }
-    impl Checkpoint for Copycat {}
-    impl Diagnostics for Copycat {}
+    let (_, method) = registry.trained_method(whole).expect("a complete run");
+    let (_, again) = registry.trained_method(resumed).expect("a complete run");
+    let best = |method: &Method| method.downcast_ref::<Copycat>().expect("a copycat").best.clone();
+    assert_eq!(best(&method), best(&again));
+    assert!(method.downcast_ref::<Random>().is_none());
+}
 
-    let registry = registry().agent("copycat", |context, _: NoOptions| {
-        let best = (f32::NEG_INFINITY, vec![0.0; context.spec.action_size]);
-        Ok(Copycat { best, rng: handful::rng::stream(context.seed, "copycat") })
-    });
+/// An agent that learns and saves nothing is not resumed, nor evaluated, as if it had learned nothing.
+#[test]
+fn an_agent_that_saves_nothing_is_refused() {
+    let registry = with_copycat(false);
     let folder = tempfile::tempdir().expect("a folder");
     let config = registry.config("puck", "copycat", 0, Some(100), None).expect("a method of its own name");
     let mut run = registry.open_run(&config, folder.path()).expect("a new run");
     while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
-    assert!(folder.path().join("test.csv").exists() && folder.path().join("evaluations.csv").exists());
+    drop(run);
+    for problem in [
+        registry.trained_method(folder.path()).map(|_| ()).expect_err("it has forgotten everything"),
+        registry.open_run(&config, folder.path()).map(|_| ()).expect_err("it has forgotten everything"),
+    ] {
+        assert!(problem.to_string().contains("saves no weights"), "{problem}");
+    }
+}
+
+/// A checkpoint with NaN in it could not be read again, so it does not replace a good one.
+#[test]
+fn a_training_state_with_nan_is_not_saved() {
+    struct Forgetful(f32);
+    impl Agent for Forgetful {
+        fn act(&mut self, _obs: &[f32], _mode: Mode) -> Vec<f32> {
+            vec![0.0; 2]
+        }
+        fn observe(&mut self, transition: &Transition) {
+            if transition.truncated {
+                self.0 = f32::NAN;
+            }
+        }
+    }
+    impl Checkpoint for Forgetful {
+        fn training_state(&self) -> Weights {
+            let mut state = Weights::default();
+            state.insert("mean", vec![self.0], [1, 1, 1]);
+            state
+        }
+    }
+    impl Diagnostics for Forgetful {}
+    let registry = registry().agent("forgetful", |_, _: NoOptions| Ok(Forgetful(0.0)));
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = registry.config("puck", "forgetful", 0, Some(100), None).expect("a method of its own name");
+    let mut run = registry.open_run(&config, folder.path()).expect("a new run");
+    run.save().expect("nothing is wrong yet");
+    let checkpoint = folder.path().join("checkpoint/state.safetensors");
+    let good = std::fs::read(&checkpoint).expect("a checkpoint");
+    let mut train = || -> Result<()> {
+        while run.steps_done() < 50 {
+            run.step()?;
+        }
+        run.save()
+    };
+    let problem = train().expect_err("NaN").to_string();
+    assert!(problem.contains("the training state's `mean` is NaN at step 50"), "{problem}");
+    assert!(std::fs::read(&checkpoint).expect("a checkpoint") == good);
+}
+
+/// What was renamed in the settings of this crate's agents keeps its name in those of others.
+#[test]
+fn settings_of_ones_own_keep_their_names() {
+    #[derive(Default, serde::Serialize, serde::Deserialize)]
+    #[serde(default, deny_unknown_fields)]
+    struct Settings {
+        propagation: String,
+        control: BTreeMap<String, f32>,
+    }
+    let own = "agent = \"mine\"\nsteps = 50\n[mine]\npropagation = \"mean\"\n[mine.control]\nhold = 2.0\n";
+    let registry = with_copycat(true)
+        .agent("mine", |context, settings: Settings| {
+            assert_eq!((settings.propagation.as_str(), settings.control["hold"]), ("mean", 2.0));
+            let best = (f32::NEG_INFINITY, vec![0.0; context.spec.action_size]);
+            Ok(Copycat { best, rng: handful::rng::stream(context.seed, "copycat"), saves: true })
+        })
+        .preset("mine", own);
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = registry.config("puck", "mine", 0, None, None).expect("a preset");
+    drop(registry.open_run(&config, folder.path()).expect("a new run"));
+    let mut run = registry.open_run(&config, folder.path()).expect("the same run");
+    while !matches!(run.step().expect("a healthy run"), Event::Tested(_)) {}
+    assert!(handful::study::run::is_complete(folder.path(), &config));
+
+    let named = with_copycat(true).agent("steps", |_, _: NoOptions| -> Result<Copycat> { unreachable!("not a name") });
+    let problem = named.config("puck", "steps", 0, None, None).expect_err("not a name").to_string();
+    assert!(problem.contains("an agent cannot be called `steps`"), "{problem}");
 }

@@ -156,8 +156,8 @@ pub struct ActorCriticConfig {
     pub penalised_components: Option<usize>,
     /// How the actor learns.
     pub gradient: ActorGradient,
-    /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic is
-    /// behind, almost every advantage is positive, and any action becomes likelier.
+    /// Whether, for REINFORCE, the mean advantage of an update is subtracted from all of them. While values grow, the critic lags
+    /// behind and almost every advantage is positive, which adds variance: each update makes nearly all drawn actions likelier.
     pub center_advantages: bool,
     /// The smallest standard deviation of the policy.
     pub min_std: f32,

@@ -41,7 +41,7 @@ use policy_state::PolicyState;
 pub use returns::{ReturnScale, lambda_returns, replay_lambda_returns};
 use update::Networks;
 
-use super::decision::{Decision, Over, in_decisions, most_observed};
+use super::decision::{Decision, Over, check_decisions, in_decisions, most_observed};
 use super::temperature::Temperature;
 use super::warm_up::RandomActions;
 use super::{Agent, Checkpoint, Diagnostics, ImaginedTrajectory, Losses, Mode, Slot, Slots, ValueEstimate};
@@ -101,6 +101,7 @@ impl Dreamer {
     pub fn new(spec: &Spec, config: DreamerConfig, seed: u64) -> Result<Self> {
         config.check_at("dreamer")?;
         spec.check()?;
+        check_decisions("dreamer", spec, config.action_repeat, 1)?;
         let mut rng = rng::stream(seed, "dreamer");
         let world = WorldModel::new(spec, &config.world, &mut rng);
         let (behaviour, target) = ActorCritic::new(&world, spec.action_size, &config.behaviour, &mut rng);

@@ -34,7 +34,7 @@ pub use config::PetsConfig;
 use controller::{Controller, MakeController};
 use objective::PlanningModel;
 
-use super::decision::{Decision, Over};
+use super::decision::{Decision, Over, check_decisions};
 use super::warm_up::RandomActions;
 use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::{KnownReward, Spec};
@@ -120,12 +120,7 @@ impl Pets {
                 spec.name
             )));
         }
-        if config.action_repeat > spec.horizon {
-            return Err(Error::Config(format!(
-                "pets.action_repeat: an episode of `{}` has only {} time steps, fewer than one decision of {}",
-                spec.name, spec.horizon, config.action_repeat
-            )));
-        }
+        check_decisions("pets", spec, config.action_repeat, 1)?;
         let mut rng = rng::stream(seed, "pets");
         let decisions = spec.horizon.div_ceil(config.action_repeat);
         let controllers = MakeController {

@@ -3,7 +3,8 @@
 //!
 //! A goal is a feature that is constant over an episode and compared with a dynamic one by a
 //! [`Role::Difference`]; the dynamic one is what was achieved. The new goal is what a later time step of the same episode achieved
-//! (the paper's strategy *future*), the difference is computed anew, and so is the reward, which therefore has to be known.
+//! (the paper's strategy *future*), the difference is computed anew, and so are the reward, which therefore has to be known, and
+//! whether the task has ended.
 
 use rand::RngExt;
 
@@ -51,11 +52,20 @@ impl Hindsight {
             let observations: Vec<_> = path.iter().map(|row| (seen(row.obs), seen(row.next_obs))).collect();
             let path = path.iter().zip(&observations).map(|(row, (obs, next_obs))| {
                 let reward = self.reward.reward(obs, row.action, next_obs);
-                Row { obs, next_obs, reward, ..*row }
+                let terminated = if relabelled { self.terminates(row, next_obs) } else { row.terminated };
+                Row { obs, next_obs, reward, terminated, ..*row }
             });
-            batch.push(&path.collect::<Vec<_>>(), gamma);
+            let mut path: Vec<Row> = path.collect();
+            let end = path.iter().position(|row| row.terminated);
+            path.truncate(end.map_or(path.len(), |end| end + 1));
+            batch.push(&path, gamma);
         }
         batch
+    }
+
+    /// Whether a transition ends the task, if its observation is `next_obs` instead: an end that the old goal explains falls away.
+    fn terminates(&self, row: &Row, next_obs: &[f32]) -> bool {
+        self.reward.terminated(next_obs) || row.terminated && !self.reward.terminated(row.next_obs)
     }
 
     /// `obs`, if the goal had been what is `achieved` in another observation.
@@ -123,6 +133,42 @@ mod tests {
             assert_eq!((batch.rewards[i], batch.steps[i]), (rewards, if x < 3.0 { 2 } else { 1 }));
         }
         assert!((relabelled as f32 / 4000.0 - 0.75).abs() < 0.035, "{relabelled}");
+    }
+
+    /// As [`There`], which ends the episode.
+    struct Over;
+
+    impl KnownReward for Over {
+        fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32 {
+            There.reward(obs, action, next_obs)
+        }
+
+        fn terminated(&self, next_obs: &[f32]) -> bool {
+            next_obs[2] == 0.0
+        }
+    }
+
+    /// From 0 to the goal 4, which ends the episode. In hindsight it ends where the new goal is reached, and returns of three steps
+    /// end there too.
+    #[test]
+    fn the_new_goal_ends_the_episode_and_the_old_one_no_longer_does() {
+        let mut replay = ReplayBuffer::new(3, 1, 100);
+        let at = |x: usize| vec![x as f32, 4.0, 4.0 - x as f32];
+        for x in 0..4 {
+            let (obs, next_obs) = (at(x), at(x + 1));
+            let reward = f32::from(x == 3);
+            let (terminated, truncated) = (x == 3, false);
+            replay.push(&Transition { obs, action: vec![0.0], reward, next_obs, terminated, truncated });
+        }
+        let hindsight = Hindsight::new(&line(), Some(Arc::new(Over)), 1.0).expect("a goal and a reward");
+        let batch = hindsight.sample(&replay, 400, 3, 0.5, &mut rng::stream(0, "hindsight"));
+        for i in 0..batch.size {
+            let [x, goal] = [batch.obs[3 * i], batch.obs[3 * i + 1]];
+            let steps = (goal - x).min(3.0);
+            assert_eq!(batch.steps[i], steps as usize, "from {x} to {goal}");
+            assert_eq!(batch.next_obs[3 * i], x + steps);
+            assert_eq!(batch.terminated[i], f32::from(x + steps == goal), "from {x} to {goal}");
+        }
     }
 
     /// On the arm's tasks a transition whose goal was relabelled has the reward that the environment would have given.

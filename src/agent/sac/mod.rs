@@ -28,7 +28,7 @@ pub use config::SacConfig;
 use hindsight::Hindsight;
 use inputs::Inputs;
 
-use super::decision::{Decision, Held};
+use super::decision::{Decision, Held, check_decisions};
 use super::temperature::Temperature;
 use super::warm_up::RandomActions;
 use super::{Losses, Slots};
@@ -116,6 +116,7 @@ impl Sac {
     pub fn with_reward(spec: &Spec, reward: Option<SharedReward>, config: SacConfig, seed: u64) -> Result<Self> {
         config.check_at("sac")?;
         spec.check()?;
+        check_decisions("sac", spec, config.action_repeat, 1)?;
         let share = config.hindsight;
         let hindsight = (share > 0.0).then(|| Hindsight::new(spec, reward, share)).transpose()?;
         let cpu = device();

@@ -30,7 +30,7 @@ pub use config::TdMpc2Config;
 use planning::{Controller, Imagined};
 pub use scale::RunningScale;
 
-use super::decision::{Decision, Over};
+use super::decision::{Decision, Over, check_decisions};
 use super::warm_up::RandomActions;
 use super::{Agent, ImaginedTrajectory, Losses, Mode, Slot, Slots};
 use crate::env::Spec;
@@ -139,6 +139,7 @@ impl TdMpc2 {
     pub fn new(spec: &Spec, config: TdMpc2Config, seed: u64) -> Result<Self> {
         config.check_at("tdmpc2")?;
         spec.check()?;
+        check_decisions("tdmpc2", spec, config.action_repeat, config.horizon)?;
         let mut rng = rng::stream(seed, "tdmpc2");
         let optimiser =
             AdamConfig { max_norm: Some(config.max_gradient_norm), ..AdamConfig::new(config.learning_rate) };

@@ -166,7 +166,7 @@ fn targets_of_several_steps_end_with_the_slice() {
 #[test]
 fn a_decision_that_was_cut_short_is_not_learned_from() {
     let spec = Spec::new("seven", [Feature::new("time")], 1, 7, 0.05);
-    let config = TdMpc2Config { action_repeat: 3, ..TdMpc2Config::default() };
+    let config = TdMpc2Config { action_repeat: 3, horizon: 2, ..TdMpc2Config::default() };
     let mut agent = TdMpc2::new(&spec, config, 0).expect("usable settings");
     for i in (0..7_u8).chain(0..7) {
         let (now, next) = (f32::from(i), f32::from(i) + 1.0);

@@ -7,7 +7,7 @@ use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, completed, in
 use crate::agent::{
     Dreamer, DreamerConfig, Method, OracleConfig, Pets, PetsConfig, Random, Sac, SacConfig, TdMpc2, TdMpc2Config,
 };
-use crate::env::{SharedReward, Spec};
+use crate::env::{Env, SharedReward, Spec};
 use crate::error::{Error, Result};
 use crate::settings::{Ranges, choices};
 
@@ -22,12 +22,21 @@ pub struct AgentContext<'a> {
 }
 
 impl AgentContext<'_> {
+    /// One more environment like those of the run, for an agent that needs one to itself; `<dyn Env>::downcast_ref` gets its type back.
+    ///
+    /// # Errors
+    /// If the environment cannot be made.
+    pub fn make_env(&self) -> Result<Box<dyn Env>> {
+        (self.env.make)(self.options)
+    }
+
     /// The environment's reward, if it is known as a function of observations.
     ///
     /// # Errors
     /// If the environment cannot be made.
     pub fn known_reward(&self) -> Result<Option<SharedReward>> {
-        self.env.known_reward.as_ref().map_or(Ok(None), |make| make(self.options))
+        let reward = self.env.known_reward.as_ref().map_or(Ok(None), |make| make(self.options))?;
+        Ok(reward.filter(|reward| reward.is_known()))
     }
 
     fn oracle(&self, config: OracleConfig) -> Result<Method> {

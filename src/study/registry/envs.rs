@@ -15,7 +15,26 @@ use crate::error::{Error, Result};
 use crate::settings::{Ranges, choices};
 use crate::study::config::settings_table;
 
-/// Settings that are read from TOML and written to it with all defaults filled in.
+/// Settings that are read from TOML and written to it with all defaults filled in. Give yours `#[serde(default, deny_unknown_fields)]`:
+/// without the first, a file has to name every setting; without the second, a misspelt one is ignored.
+///
+/// ```
+/// #[derive(serde::Serialize, serde::Deserialize)]
+/// #[serde(default, deny_unknown_fields)]
+/// struct Windy {
+///     /// Speed of the wind, m/s.
+///     wind: f32,
+/// }
+///
+/// impl Default for Windy {
+///     fn default() -> Self {
+///         Self { wind: 1.0 }
+///     }
+/// }
+///
+/// fn usable(_: impl handful::study::registry::Settings) {}
+/// usable(Windy::default());
+/// ```
 pub trait Settings: Serialize + DeserializeOwned + Default + Send + Sync + 'static {}
 
 impl<S: Serialize + DeserializeOwned + Default + Send + Sync + 'static> Settings for S {}

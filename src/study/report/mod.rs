@@ -3,6 +3,7 @@
 mod results;
 mod task;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -11,7 +12,7 @@ use super::provenance;
 use super::replays;
 use super::starts::Starts;
 use super::tables::Tables;
-use super::verdict::{TOLD_THE_REWARD, verdict};
+use super::verdict::verdict;
 use crate::error::{Result, shortened};
 use crate::files;
 
@@ -54,7 +55,7 @@ pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String))
     if !verdict.is_empty() {
         text += &format!("## Verdict\n\n{verdict}\n");
     }
-    text += &format!("## What is compared\n\n{}\n", terms(&pairs));
+    text += &format!("## What is compared\n\n{}\n", terms(&tables, &pairs)?);
     text += &format!("## Results\n\n{}", results::section(&tables)?);
     let (replays, problems) = replays::of_report(&tables, from, to)?;
     for problem in problems {
@@ -108,9 +109,13 @@ fn tuning_note(tables: &Tables) -> Result<&'static str> {
 }
 
 /// What all methods have in common, and what some know that the others do not.
-fn terms(pairs: &[(String, String)]) -> String {
-    let told = TOLD_THE_REWARD.into_iter().filter(|told| pairs.iter().any(|(_, method)| method == told));
-    let told: Vec<String> = told.map(|method| format!("`{method}`")).collect();
+fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
+    let mut told = Vec::new();
+    for method in pairs.iter().map(|(_, method)| method).collect::<BTreeSet<_>>() {
+        if tables.is_told_the_reward(method)? {
+            told.push(format!("`{method}`"));
+        }
+    }
     let mut text = String::from(
         "All methods have the same tasks, observations and initial states. They are evaluated without exploration noise (planners still \
          sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \
@@ -118,14 +123,18 @@ fn terms(pairs: &[(String, String)]) -> String {
     );
     if !told.is_empty() {
         text += &format!(
-            "\nThe methods do not have the same information: {} plan{} with the reward as a function{}. The other learning methods have \
+            "\nThe methods do not have the same information: {} know{} the reward as a function{}. The other learning methods have \
              only the rewards that they receive.\n",
             told.join(" and "),
             if told.len() == 1 { "s" } else { "" },
-            if told.iter().any(|method| method == "`oracle`") { ", `oracle` in the true simulator" } else { "" },
+            if told.iter().any(|method| method == "`oracle`") {
+                ", and `oracle` plans in the true simulator"
+            } else {
+                ""
+            },
         );
     }
-    text
+    Ok(text)
 }
 
 fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {

@@ -18,9 +18,14 @@ pub(super) fn section(tables: &Tables, task: &str, differ: bool, replays: &[Repl
     let mut figure = |file: String, caption: &str| text += &format!("\n![{caption}]({file})\n");
     let file = format!("{task}-learning.svg");
     if figures::learning_curves(tables, task, &to.join(&file))? {
-        let caption = "Success rate over environment steps, a panel for each method: thin lines are seeds, the thick line is their mean; \
-                       grey lines are the means of the other methods";
-        figure(file, caption);
+        let what = if tables.is_without_success(task)? { "Return (no evaluation succeeds)" } else { "Success rate" };
+        figure(
+            file,
+            &format!(
+                "{what} over environment steps, a panel for each method: thin lines are seeds, the thick line is their mean; \
+                 grey lines are the means of the other methods"
+            ),
+        );
     }
     let file = format!("{task}-profile.svg");
     if figures::profile(tables, task, &to.join(&file))? {

@@ -10,6 +10,7 @@ use polars::prelude::*;
 mod admission;
 mod gather;
 mod join;
+mod place;
 mod read;
 mod runs;
 mod whole;
@@ -19,8 +20,10 @@ use super::summary::summarise;
 use crate::chart::LARGEST;
 use crate::error::{Error, Result};
 use crate::files;
+#[cfg(feature = "cli")]
+pub(crate) use place::check_place;
 pub use runs::Run;
-use runs::{check_runs, run_names};
+use runs::check_runs;
 
 /// The success rate of the column `steps_to_80`.
 pub const LEVEL: f64 = 0.8;
@@ -87,24 +90,6 @@ impl Tables {
         Ok(self)
     }
 
-    /// # Errors
-    /// If the folder holds the tables of a study with a run that these do not have: nothing could restore them.
-    pub(super) fn check_place(&self, folder: &Path) -> Result<()> {
-        let path = folder.join("tests.csv");
-        if !path.exists() {
-            return Ok(());
-        }
-        let ours = run_names(&self.tests).map_err(inside)?;
-        let theirs = run_names(&read::of_study(&path, &read::TESTS)?).map_err(inside)?;
-        match theirs.iter().find(|run| !ours.contains(run)) {
-            None => Ok(()),
-            Some((task, method, seed)) => Err(Error::Config(format!(
-                "{}: this folder holds the tables of another study (with `{method}` on `{task}`, seed {seed}); choose another --out",
-                folder.display()
-            ))),
-        }
-    }
-
     /// On which starts the runs were tested. Tables of earlier versions do not say: they know only the test's.
     ///
     /// # Errors
@@ -169,7 +154,28 @@ impl Tables {
         curves(&self.evaluations, task, method, "success").map_err(inside)
     }
 
-    /// The same over environment steps: the seconds of training until each evaluation. Empty if the tables do not tell them.
+    /// The same for the mean return of each evaluation.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn return_curves(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
+        curves(&self.evaluations, task, method, "return_mean").map_err(inside)
+    }
+
+    /// Whether no method ever succeeds on a task in an evaluation: it may be one that is judged by its return.
+    ///
+    /// # Errors
+    /// If the table lacks a column.
+    pub fn is_without_success(&self, task: &str) -> Result<bool> {
+        for (_, method) in self.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+            if self.curves(task, &method)?.iter().flat_map(|(_, success)| success).any(|success| *success > 0.0) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Over environment steps, the seconds of training until each evaluation. Empty if the tables do not tell them.
     ///
     /// # Errors
     /// If the table lacks a column.

@@ -57,6 +57,36 @@ impl Tables {
         Ok(column("run")?.into_iter().zip(column("reason")?).collect())
     }
 
+    /// Whether a method, of one of our agents, has the reward as a function: as its runs' configuration says, or its name where that is
+    /// not recorded. The others have only the rewards that they receive.
+    ///
+    /// # Errors
+    /// If the table lacks a column, or a configuration is not TOML.
+    pub fn is_told_the_reward(&self, method: &str) -> Result<bool> {
+        let runs: Vec<Run> = self.runs()?.into_iter().filter(|run| run.method == method).collect();
+        let by_name = ["oracle", "pets"].contains(&method);
+        let settings = settings(&runs)?;
+        if settings.is_empty() {
+            return Ok(by_name);
+        }
+        Ok(settings.values().any(|settings| {
+            let of = |path: &[&str]| path.iter().try_fold(settings, |table, name| table.get(*name)?.as_table());
+            match settings.get("agent").and_then(toml::Value::as_str) {
+                Some("oracle") => true,
+                Some("pets") => {
+                    let learns = of(&["pets", "ensemble"]).and_then(|table| table.get("learn_reward")?.as_bool());
+                    !learns.unwrap_or(false)
+                }
+                Some("sac") => {
+                    let relabelled = of(&["sac"]).and_then(|table| table.get("hindsight")?.as_float());
+                    relabelled.unwrap_or(0.0) > 0.0
+                }
+                Some(_) => false,
+                None => by_name,
+            }
+        }))
+    }
+
     /// The seeds of each method that learns, by task and method.
     ///
     /// # Errors
