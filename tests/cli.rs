@@ -44,6 +44,29 @@ fn a_study_does_not_replace_the_tables_of_another() {
     refused(here, &study(&["--out", "own"]), &["own", other]);
 }
 
+/// Among the methods that nobody asked for.
+#[test]
+fn what_a_task_does_not_have_is_left_out() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = handful(folder.path(), &["study", "--tasks", "pendulum", "--profile", "full", "--status"]);
+    let (said, answered) = (text(&output.stderr), text(&output.stdout));
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("without scripted: pendulum has no scripted policy"), "{said}");
+    assert!(answered.contains("pendulum oracle") && !answered.contains("scripted"), "{answered}");
+}
+
+#[test]
+fn whatever_needs_no_training_can_be_watched() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let watch = |policy: &'static str| ["watch", "--task", "pendulum", "--policy", policy];
+    let output = handful(folder.path(), &watch("oracle"));
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    assert!(folder.path().join("pendulum-oracle.html").exists());
+    refused(folder.path(), &watch("sac"), &["unknown policy `sac`; known: random, scripted, oracle"]);
+    refused(folder.path(), &watch("scripted"), &["pendulum has no scripted policy"]);
+    refused(folder.path(), &["watch", "--task", "pendulun", "--policy", "oracle"], &["unknown task `pendulun`"]);
+}
+
 #[test]
 fn bad_input_is_refused_in_one_line() {
     let folder = tempfile::tempdir().expect("a folder");

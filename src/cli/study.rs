@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use indicatif::HumanDuration;
 
-use super::output::answer;
+use super::output::{answer, note};
 use super::progress::Progress;
 use super::{refuse_folder_of, stop_on_ctrl_c};
 use crate::error::Result;
@@ -79,7 +79,10 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     if let Some(tasks) = args.tasks {
         plan = plan.with_tasks(tasks);
     }
-    plan.methods = args.methods.unwrap_or(plan.methods);
+    match args.methods {
+        Some(methods) => plan.methods = methods,
+        None => leave_out_what_a_task_lacks(registry, &mut plan),
+    }
     plan.seeds = args.seeds.unwrap_or(plan.seeds);
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
     refuse_folder_of("run", "config.toml", &plan.folder)?;
@@ -99,6 +102,22 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
     progress.finish();
     conclude(registry, &runs, &plan.folder)
+}
+
+/// Of the methods that nobody asked for, those that some task cannot have (an oracle, a script) are left out.
+fn leave_out_what_a_task_lacks(registry: &Registry, plan: &mut StudyPlan) {
+    let StudyPlan { tasks, methods, .. } = plan;
+    methods.retain(|method| {
+        let lacks = tasks.iter().find_map(|task| {
+            // What else is wrong is told when the runs are made.
+            let config = registry.config(task, method, 0, None, None).ok()?;
+            registry.method(&config).err()
+        });
+        if let Some(problem) = &lacks {
+            note(format_args!("without {method}: {problem}"));
+        }
+        lacks.is_none()
+    });
 }
 
 /// A line for each task and method, and one for all.

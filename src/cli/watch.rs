@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use super::output::answer;
 use super::whole;
 use crate::error::{Error, Result};
+use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 use crate::study::starts::EvalSeeds;
 use crate::watch::Recording;
@@ -17,7 +18,7 @@ pub(super) struct Args {
     /// A task, for a policy that needs no training
     #[arg(long)]
     task: Option<String>,
-    /// That policy: scripted or random
+    /// That policy: scripted, random, oracle, or another that does not learn
     #[arg(long, default_value = "scripted", conflicts_with = "run")]
     policy: String,
     /// The seed of the initial state: the first that `evaluate --seed` meets with it
@@ -28,6 +29,25 @@ pub(super) struct Args {
     out: Option<PathBuf>,
 }
 
+/// The configuration of a policy that does not learn.
+fn without_training(registry: &Registry, task: &str, policy: &str, seed: u64) -> Result<RunConfig> {
+    let fixed = |policy: &str| {
+        registry.config(task, policy, seed, None, None).map(|config| (!config.learns()).then_some(config))
+    };
+    match fixed(policy) {
+        Ok(Some(config)) => Ok(config),
+        Err(problem)
+            if registry.method_names().any(|name| name == policy) || !registry.env_names().any(|name| name == task) =>
+        {
+            Err(problem)
+        }
+        _ => {
+            let known = registry.method_names().filter(|name| matches!(fixed(name), Ok(Some(_))));
+            Err(Error::unknown("policy", policy, known))
+        }
+    }
+}
+
 pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let (config, mut method, default) = match (&args.run, &args.task) {
         (Some(folder), _) => {
@@ -35,13 +55,9 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
             (config, method, folder.join("watch.html"))
         }
         (None, Some(task)) => {
-            let policy = args.policy.as_str();
-            if !["scripted", "random"].contains(&policy) {
-                return Err(Error::unknown("policy", policy, ["scripted", "random"]));
-            }
-            let config = registry.config(task, policy, args.seed, None, None)?;
+            let config = without_training(registry, task, &args.policy, args.seed)?;
             let method = registry.method(&config)?;
-            (config, method, PathBuf::from(format!("{task}-{policy}.html")))
+            (config, method, PathBuf::from(format!("{task}-{}.html", args.policy)))
         }
         (None, None) => unreachable!("the command line asks for one of them"),
     };

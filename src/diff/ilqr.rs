@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use super::derivatives::{Linear, linearise};
 use super::{System, roll_out};
+use crate::settings::{must_hold, ranges};
 
 /// Settings of [`Ilqr`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -38,6 +39,8 @@ impl Default for IlqrConfig {
         Self { iterations: 100, tolerance: 1e-6, regularisation: 1.0 }
     }
 }
+
+ranges!(IlqrConfig { iterations: 0..=1_000_000, tolerance: 0.0..=1.0, regularisation: 0.0..=1e9 });
 
 /// Beyond this regularisation no further improvement is expected.
 const MAX_REGULARISATION: f64 = 1e10;
@@ -84,7 +87,11 @@ struct Change<const N: usize, const M: usize> {
 
 impl Ilqr {
     /// An optimiser with these settings.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn new(config: IlqrConfig) -> Self {
+        must_hold(&config, "ilqr");
         Self { config }
     }
 

@@ -16,6 +16,7 @@ use super::System;
 use crate::nn::ops::{join, map_rows, record, total};
 use crate::nn::{Activation, Adam, AdamConfig, Grad, Init, Mlp, MlpConfig, Norm, Tensor3, device, tensor, values};
 use crate::rng::Rng;
+use crate::settings::{must_hold, ranges};
 
 /// A [`System`] as an environment for [`AnalyticPolicyGradient`]: with observations of `O` numbers and initial states.
 pub trait PolicyEnv<const N: usize, const M: usize, const O: usize>: System<N, M> {
@@ -51,6 +52,15 @@ impl Default for AnalyticPolicyGradientConfig {
     }
 }
 
+ranges!(AnalyticPolicyGradientConfig {
+    hidden: 1..=4096,
+    learning_rate: 0.0..=1.0,
+    max_norm: 1e-6..=1e6,
+    worlds: 1..=10_000,
+    window: 1..=10_000,
+    episode: 1..=1_000_000,
+});
+
 /// A policy network and the systems that it is trained on.
 ///
 /// ```
@@ -82,7 +92,11 @@ pub struct AnalyticPolicyGradient<const N: usize, const M: usize, const O: usize
 
 impl<const N: usize, const M: usize, const O: usize> AnalyticPolicyGradient<N, M, O> {
     /// An untrained policy, whose actions are near zero.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn new(system: &impl PolicyEnv<N, M, O>, config: AnalyticPolicyGradientConfig, rng: &mut Rng) -> Self {
+        must_hold(&config, "policy");
         let shape = MlpConfig {
             members: 1,
             input: O,

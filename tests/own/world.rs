@@ -85,6 +85,9 @@ fn what_is_missing_is_named() {
     assert!(refusal("oracle").contains("with_oracle"), "{}", refusal("oracle"));
     assert!(refusal("scripted").contains("no scripted policy"), "{}", refusal("scripted"));
     assert!(refusal("pets").contains("learn_reward"), "{}", refusal("pets"));
+    let misspelt = bare.preset("mine", "base = \"sac\"\n[for.baer.sac]\nbatch = 8\n");
+    let problem = misspelt.config("bare", "mine", 0, None, None).expect_err("no such task").to_string();
+    assert!(problem.contains("the preset `mine`: unknown task `baer`") && problem.contains("`bare`"), "{problem}");
 }
 
 /// Names become folders, figures and Markdown; one that cannot is told when it is used.

@@ -147,7 +147,7 @@ impl Registry {
     /// by `steps` if it is given. All defaults are filled in.
     ///
     /// # Errors
-    /// If task or method are unknown, `seed` or `steps` is too large, the file cannot be read, or a field or value in it is
+    /// If task or method are unknown, a preset has settings for an unknown task, `seed` or `steps` is too large, the file cannot be read, or a field or value in it is
     /// wrong.
     pub fn config(
         &self,
@@ -158,6 +158,11 @@ impl Registry {
         file: Option<&Path>,
     ) -> Result<RunConfig> {
         let choices = self.choices(task)?;
+        for (name, text) in &self.presets {
+            // A preset that cannot be read is told when it is used.
+            let tasks = toml::from_str(text).map_or(Ok(()), |preset| self.check_tasks(&preset));
+            tasks.map_err(|problem| Error::Config(format!("the preset `{name}`: {problem}")))?;
+        }
         let mut table = preset_table(&self.presets, task, method, &choices)?;
         if let Some(path) = file {
             self.change(&mut table, path, task, &choices)?;
@@ -199,8 +204,7 @@ impl Registry {
         let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
         let mut changes: Table = toml::from_str(&text).map_err(|problem| bad_config(path, &problem))?;
         let wrong = |problem: String| Error::Config(format!("{}: {problem}", path.display()));
-        let mut tasks = changes.get("for").and_then(Value::as_table).into_iter().flat_map(Table::keys);
-        tasks.try_for_each(|task| self.env_entry(task).map(|_| ())).map_err(|problem| wrong(problem.to_string()))?;
+        self.check_tasks(&changes).map_err(|problem| wrong(problem.to_string()))?;
         // Otherwise an old name would stand beside the new one that the preset uses.
         upgrade_keys(&mut changes);
         specialise(&mut changes, task, choices).map_err(|problem| wrong(problem.to_string()))?;
@@ -300,6 +304,13 @@ impl Registry {
             load_weights(folder, &as_read, &mut method)?;
         }
         Ok((config, method))
+    }
+
+    /// # Errors
+    /// If a table `[for.TASK]` is for a task that there is not.
+    fn check_tasks(&self, settings: &Table) -> Result<()> {
+        let mut tasks = settings.get("for").and_then(Value::as_table).into_iter().flat_map(Table::keys);
+        tasks.try_for_each(|task| self.env_entry(task).map(|_| ()))
     }
 
     fn env_entry(&self, name: &str) -> Result<&ErasedEnv> {
