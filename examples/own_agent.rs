@@ -49,15 +49,17 @@ impl Ars {
     /// If a setting cannot be used.
     pub fn new(spec: &Spec, config: ArsConfig, seed: u64) -> Result<Self> {
         let ArsConfig { directions, best, noise, step_size } = config;
-        if best == 0 || best > directions || directions > 10_000 {
-            return Err(Error::Config(format!(
-                "ars.best is {best}; it must lie in 1..={directions} (and `directions` below 10,000)"
-            )));
+        let refuse = |problem: String| Err(Error::Config(problem));
+        if !(1..=10_000).contains(&directions) {
+            return refuse(format!("ars.directions is {directions}; it must lie in 1..=10000"));
         }
-        if !(noise > 0.0 && noise.is_finite() && step_size.is_finite()) {
-            return Err(Error::Config(format!(
-                "ars.noise is {noise}, ars.step_size {step_size}; the first must be positive, both finite"
-            )));
+        if !(1..=directions).contains(&best) {
+            return refuse(format!("ars.best is {best}; it must lie in 1..={directions}, the number of directions"));
+        }
+        for (name, value) in [("noise", noise), ("step_size", step_size)] {
+            if !(value > 0.0 && value.is_finite()) {
+                return refuse(format!("ars.{name} is {value}; it must be positive and finite"));
+            }
         }
         let size = spec.action_size * spec.observation_size();
         let mut rng = rng::stream(seed, "ars");

@@ -99,9 +99,12 @@ pub(super) fn check_decisions(agent: &str, spec: &Spec, action_repeat: usize, de
     if spec.horizon / action_repeat >= decisions {
         return Ok(());
     }
+    let instead = if decisions > 1 { "`action_repeat` or `horizon`" } else { "`action_repeat`" };
     Err(Error::Config(format!(
-        "{agent}.action_repeat: an episode of `{}` has only {} time steps; the agent needs {decisions} decisions of {action_repeat} or more",
-        spec.name, spec.horizon
+        "{agent}: an episode of `{}` has only {} time steps; the agent needs {} ({decisions} x {action_repeat}) or more: lower its {instead}",
+        spec.name,
+        spec.horizon,
+        decisions * action_repeat
     )))
 }
 

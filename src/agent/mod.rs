@@ -137,7 +137,8 @@ pub trait Agent: Send {
     /// The action that [`Agent::act_batch`] would choose in one slot, with some of the imagined trajectories behind it;
     /// none for agents that do not imagine.
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
-        (self.act_batch(&[*slot]).pop().expect("one action for one slot"), Vec::new())
+        // Without an action, an empty one, which every environment refuses.
+        (self.act_batch(&[*slot]).pop().unwrap_or_default(), Vec::new())
     }
 }
 

@@ -81,7 +81,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     }
     match args.methods {
         Some(methods) => plan.methods = methods,
-        None => leave_out_what_a_task_lacks(registry, &mut plan),
+        None => leave_out_what_a_task_lacks(registry, &mut plan)?,
     }
     plan.seeds = args.seeds.unwrap_or(plan.seeds);
     let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
@@ -92,11 +92,11 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
         *config = registry.as_begun(config, folder);
         check_run(folder, config)?;
     }
-    #[cfg(feature = "study")]
-    crate::study::tables::check_place(&plan.folder, &runs)?;
     if args.status {
         return answer(report_status(&status(&runs), jobs));
     }
+    #[cfg(feature = "study")]
+    crate::study::tables::check_place(&plan.folder, &runs)?;
     let stop = stop_on_ctrl_c()?;
     let progress = Progress::new(&runs);
     runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
@@ -104,20 +104,31 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     conclude(registry, &runs, &plan.folder)
 }
 
-/// Of the methods that nobody asked for, those that some task cannot have (an oracle, a script) are left out.
-fn leave_out_what_a_task_lacks(registry: &Registry, plan: &mut StudyPlan) {
-    let StudyPlan { tasks, methods, .. } = plan;
-    methods.retain(|method| {
-        let lacks = tasks.iter().find_map(|task| {
-            // What else is wrong is told when the runs are made.
-            let config = registry.config(task, method, 0, None, None).ok()?;
-            registry.method(&config).err()
-        });
-        if let Some(problem) = &lacks {
-            note(format_args!("without {method}: {problem}"));
+/// Of the methods that nobody asked for, those are left out that need something which one of the tasks does not have: a script, a
+/// snapshot, a known reward.
+///
+/// # Errors
+/// If something else is wrong with a task or a method.
+fn leave_out_what_a_task_lacks(registry: &Registry, plan: &mut StudyPlan) -> Result<()> {
+    let mut kept = Vec::new();
+    for method in std::mem::take(&mut plan.methods) {
+        let mut lacks = None;
+        for task in &plan.tasks {
+            let config = registry.config(task, &method, 0, None, None)?;
+            registry.make_env(&config)?.spec().check()?;
+            let needs = ["scripted", "oracle", "pets"].contains(&config.agent.as_str());
+            match registry.method(&config) {
+                Err(problem) if needs => lacks = Some(problem),
+                made => drop(made?),
+            }
         }
-        lacks.is_none()
-    });
+        match lacks {
+            Some(problem) => note(format_args!("without {method}: {problem}")),
+            None => kept.push(method),
+        }
+    }
+    plan.methods = kept;
+    Ok(())
 }
 
 /// A line for each task and method, and one for all.

@@ -40,7 +40,7 @@ impl Default for IlqrConfig {
     }
 }
 
-ranges!(IlqrConfig { iterations: 0..=1_000_000, tolerance: 0.0..=1.0, regularisation: 0.0..=1e9 });
+ranges!(IlqrConfig { iterations: 0..=1_000_000, tolerance: 0.0..=1.0, regularisation: 1e-8..=1e9 });
 
 /// Beyond this regularisation no further improvement is expected.
 const MAX_REGULARISATION: f64 = 1e10;

@@ -122,8 +122,7 @@ pub trait Env: std::any::Any + Send {
     /// differ in their upper bits, and as a `u32` or an `f32` some of them would be equal.
     fn reset(&mut self, seed: u64) -> Vec<f32>;
 
-    /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound. After a truncation, stepping on must be
-    /// possible: plans of the oracle reach beyond the time limit.
+    /// Acts for one control step. Numbers outside [-1, 1] count as the nearest bound.
     ///
     /// # Errors
     /// [`crate::error::Error::Action`] if the action has the wrong length or is not finite; nothing has moved then.
@@ -269,6 +268,6 @@ pub trait Snapshot {
     fn snapshot(&self) -> Self::State;
 
     /// Goes back to a state that [`Snapshot::snapshot`] of this environment, or of one made alike, has returned. This environment
-    /// may never have been reset.
+    /// may never have been reset. It must be possible to step on from there beyond the time limit: plans of the oracle do.
     fn restore(&mut self, state: &Self::State);
 }

@@ -300,3 +300,19 @@ pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
     };
     Error::ConfigFile { path: path.into(), problem, source: Box::new(source.clone()) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Otherwise an agent of that name would put its settings into their place.
+    #[test]
+    fn no_agent_is_called_like_an_entry() {
+        let text = "task = \"reach\"\nmethod = \"sac\"\nseed = 0\nagent = \"sac\"\nsteps = 1\nshake = 1\n";
+        let config: RunConfig = toml::from_str(text).expect("a configuration");
+        for entry in config.to_table().keys().map(String::as_str).chain([VALUES, "for", "base"]) {
+            let problem = RunConfig { agent: entry.into(), ..config.clone() }.check().expect_err(entry).to_string();
+            assert!(problem.contains(&format!("cannot be called `{entry}`")), "{problem}");
+        }
+    }
+}

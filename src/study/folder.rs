@@ -95,12 +95,11 @@ impl RunFolder {
         let progress = state.note("progress").ok_or_else(|| foreign(Error::Config("it tells no progress".into())))?;
         let progress = toml::from_str(progress)
             .map_err(|problem| foreign(Error::Config(format!("its progress: {}", problem.message()))))?;
-        let weights = state.extract("weights.");
         if config.learns() {
-            check_saved(&weights, &path)?;
+            check_saved(&state, &path)?;
         }
         let checkpoint = method.checkpoint_mut();
-        checkpoint.load_weights(&weights).map_err(foreign)?;
+        checkpoint.load_weights(&state.extract("weights.")).map_err(foreign)?;
         checkpoint.load_training_state(&state).map_err(foreign)?;
         Ok(Some(progress))
     }
@@ -265,7 +264,8 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
 /// If an agent that learns has saved nothing: it could only act as if it had learned nothing.
 fn check_saved(weights: &Weights, path: &Path) -> Result<()> {
     if weights.is_empty() {
-        let advice = "this agent saves no weights, so its run can neither be resumed nor used; implement its `Checkpoint::weights`";
+        let advice = "this agent saves nothing, so its run can neither be resumed nor used; \
+                      implement its `Checkpoint`, and remove the folder to start anew";
         return Err(Error::checkpoint(path, advice, None));
     }
     Ok(())

@@ -122,12 +122,17 @@ impl StudyPlan {
             registry.method(&config)?;
             let seeds = if config.learns() { self.seeds.clone() } else { self.seeds.start..self.seeds.start + 1 };
             runs.extend(seeds.map(|seed| {
-                let folder = self.folder.join(task).join(method).join(format!("seed{seed}"));
+                let folder = run_folder(&self.folder, task, method, seed);
                 (RunConfig { seed, ..config.clone() }, folder)
             }));
         }
         Ok(runs)
     }
+}
+
+/// The folder of a run in that of its study.
+pub(crate) fn run_folder(study: &Path, task: &str, method: &str, seed: u64) -> PathBuf {
+    study.join(task).join(method).join(format!("seed{seed}"))
 }
 
 /// Receives the progress of the runs; `&()` ignores it. Calls come from several threads.

@@ -48,7 +48,7 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
     };
     let mut informed = Vec::new();
     for (_, method) in &medians {
-        if tables.is_told_the_reward(method)? {
+        if tables.is_told_the_reward(task, method)? {
             informed.push(*method);
         }
     }

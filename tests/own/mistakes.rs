@@ -94,8 +94,10 @@ fn a_policy_has_an_action_for_each_environment() {
         assert!(problem.contains(said), "{problem}");
     }
     evaluator.evaluate(&mut Short(4), 4, EvalSeeds::Test).expect("enough");
-    let recording = Recording::of_episode("short".into(), line(5), &mut Short(0) as &mut dyn Policy, 0);
-    recording.map(|_| ()).expect_err("no action");
+    let world = Line { poses: vec![Pose::translation(0.1, 0.0, 0.0)], ..line(5) };
+    let recording = Recording::of_episode("short".into(), world, &mut Short(0), 0);
+    let problem = recording.map(|_| ()).expect_err("no action").to_string();
+    assert!(problem.contains("an action has 1 numbers, this one has 0"), "{problem}");
 }
 
 /// Such as a simulator with three licences.
@@ -140,7 +142,7 @@ fn decisions_fit_into_an_episode() {
                 Ok(_) => assert!(fits, "{method}"),
                 Err(problem) => {
                     let problem = problem.to_string();
-                    let said = format!("{agent}.action_repeat: an episode of `line` has only 5 time steps");
+                    let said = format!("{agent}: an episode of `line` has only 5 time steps");
                     assert!(!fits && problem.contains(&said), "{problem}");
                 }
             }

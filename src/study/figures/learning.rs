@@ -11,7 +11,7 @@ use crate::error::Result;
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
 pub fn learning_curves(tables: &Tables, task: &str, path: &Path) -> Result<bool> {
-    let by_return = tables.is_without_success(task)?;
+    let by_return = tables.is_judged_by_return(task)?;
     let mut learning = Vec::new();
     for (colour, method) in methods(tables, task)? {
         let curves = if by_return { tables.return_curves(task, &method)? } else { tables.curves(task, &method)? };

@@ -110,12 +110,13 @@ fn tuning_note(tables: &Tables) -> Result<&'static str> {
 
 /// What all methods have in common, and what some know that the others do not.
 fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
-    let mut told = Vec::new();
-    for method in pairs.iter().map(|(_, method)| method).collect::<BTreeSet<_>>() {
-        if tables.is_told_the_reward(method)? {
-            told.push(format!("`{method}`"));
+    let mut told = BTreeSet::new();
+    for (task, method) in pairs {
+        if tables.is_told_the_reward(task, method)? {
+            told.insert(format!("`{method}`"));
         }
     }
+    let told: Vec<String> = told.into_iter().collect();
     let mut text = String::from(
         "All methods have the same tasks, observations and initial states. They are evaluated without exploration noise (planners still \
          sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \

@@ -18,7 +18,7 @@ pub(super) fn section(tables: &Tables, task: &str, differ: bool, replays: &[Repl
     let mut figure = |file: String, caption: &str| text += &format!("\n![{caption}]({file})\n");
     let file = format!("{task}-learning.svg");
     if figures::learning_curves(tables, task, &to.join(&file))? {
-        let what = if tables.is_without_success(task)? { "Return (no evaluation succeeds)" } else { "Success rate" };
+        let what = if tables.is_judged_by_return(task)? { "Return (no evaluation succeeds)" } else { "Success rate" };
         figure(
             file,
             &format!(

@@ -154,19 +154,22 @@ impl Tables {
         curves(&self.evaluations, task, method, "success").map_err(inside)
     }
 
-    /// The same for the mean return of each evaluation.
+    /// The same for the mean return of each evaluation. Empty if the tables do not tell it.
     ///
     /// # Errors
     /// If the table lacks a column.
     pub fn return_curves(&self, task: &str, method: &str) -> Result<Vec<Curve>> {
-        curves(&self.evaluations, task, method, "return_mean").map_err(inside)
+        optional_curves(&self.evaluations, task, method, "return_mean").map_err(inside)
     }
 
-    /// Whether no method ever succeeds on a task in an evaluation: it may be one that is judged by its return.
+    /// Whether a task is one to be judged by its return: no method ever succeeds in an evaluation, and returns are known.
     ///
     /// # Errors
     /// If the table lacks a column.
-    pub fn is_without_success(&self, task: &str) -> Result<bool> {
+    pub fn is_judged_by_return(&self, task: &str) -> Result<bool> {
+        if self.evaluations.column("return_mean").is_err() {
+            return Ok(false);
+        }
         for (_, method) in self.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
             if self.curves(task, &method)?.iter().flat_map(|(_, success)| success).any(|success| *success > 0.0) {
                 return Ok(false);

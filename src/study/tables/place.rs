@@ -8,18 +8,19 @@ use super::runs::{RunName, run_names};
 use super::{Tables, inside, read};
 use crate::error::{Error, Result};
 #[cfg(feature = "cli")]
-use crate::study::config::RunConfig;
+use crate::study::{config::RunConfig, runner::run_folder};
 
 impl Tables {
     /// # Errors
     /// If the folder holds the tables of a study with a run that these do not have: nothing could restore them.
     pub(in crate::study) fn check_place(&self, folder: &Path) -> Result<()> {
         let ours = run_names(&self.tests).map_err(inside)?;
-        check(folder, |run| ours.contains(run))
+        check(folder, &runs_in(folder)?, |run| ours.contains(run))
     }
 }
 
-/// The same before a study of these runs. The tables of runs that are in the folder themselves can be made again.
+/// The same before a study of these runs. The tables of runs that are in the folder themselves can be made again, and a table that cannot
+/// be read is made anew.
 ///
 /// # Errors
 /// If the folder holds the tables of a study with a run that is neither one of these nor in the folder.
@@ -28,16 +29,20 @@ pub(crate) fn check_place(folder: &Path, runs: &[(RunConfig, PathBuf)]) -> Resul
     let ours = |(task, method, seed): &RunName| {
         runs.iter().any(|(run, _)| run.task == *task && run.method == *method && run.seed == *seed)
     };
-    let there = |(task, method, seed): &RunName| folder.join(task).join(method).join(format!("seed{seed}")).is_dir();
-    check(folder, |run| ours(run) || there(run))
+    let there = |(task, method, seed): &RunName| run_folder(folder, task, method, *seed).is_dir();
+    check(folder, &runs_in(folder).unwrap_or_default(), |run| ours(run) || there(run))
 }
 
-fn check(folder: &Path, is_safe: impl Fn(&RunName) -> bool) -> Result<()> {
+/// The runs in the tables of a folder.
+fn runs_in(folder: &Path) -> Result<Vec<RunName>> {
     let path = folder.join("tests.csv");
     if !path.exists() {
-        return Ok(());
+        return Ok(Vec::new());
     }
-    let theirs = run_names(&read::of_study(&path, &read::TESTS)?).map_err(inside)?;
+    run_names(&read::of_study(&path, &read::TESTS)?).map_err(inside)
+}
+
+fn check(folder: &Path, theirs: &[RunName], is_safe: impl Fn(&RunName) -> bool) -> Result<()> {
     match theirs.iter().find(|run| !is_safe(run)) {
         None => Ok(()),
         Some((task, method, seed)) => Err(Error::Config(format!(

@@ -47,7 +47,7 @@ pub(super) struct TableFormat {
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Need {
     Always,
-    /// Nothing is computed from it.
+    /// Nothing but figures is computed from it.
     Optional,
 }
 use Need::{Always, Optional};

@@ -57,13 +57,14 @@ impl Tables {
         Ok(column("run")?.into_iter().zip(column("reason")?).collect())
     }
 
-    /// Whether a method, of one of our agents, has the reward as a function: as its runs' configuration says, or its name where that is
-    /// not recorded. The others have only the rewards that they receive.
+    /// Whether a method, of one of our agents, has the reward of a task as a function: as its runs' configuration says, or its name where
+    /// that is not recorded. The others have only the rewards that they receive.
     ///
     /// # Errors
     /// If the table lacks a column, or a configuration is not TOML.
-    pub fn is_told_the_reward(&self, method: &str) -> Result<bool> {
-        let runs: Vec<Run> = self.runs()?.into_iter().filter(|run| run.method == method).collect();
+    pub fn is_told_the_reward(&self, task: &str, method: &str) -> Result<bool> {
+        let mut runs = self.runs()?;
+        runs.retain(|run| run.task == task && run.method == method);
         let by_name = ["oracle", "pets"].contains(&method);
         let settings = settings(&runs)?;
         if settings.is_empty() {
