@@ -232,30 +232,22 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("README.md", format!("whose dynamics have no lasso, they are {:.2} and {:.1}", pets[0], pets[1])),
     ]);
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
-    let [times, low, high] = sac_steps_ratio("push", "pets");
-    let [pets, sac] = ["pets", "sac"].map(|method| push(method, "smoothness_sparc"));
-    let [from, to] = ["success_minus_sac_t_low", "success_minus_sac_t_high"].map(|column| 100.0 * push("pets", column));
-    let by = |method: &str| thousands(push(method, "steps_to_80"));
-    quotes.extend([
-        (
-            "README.md",
-            format!(
-                "On `push`, PETS is at 80 % by step {} in the median, SAC by step {}, both with all five seeds: SAC takes {times:.1} times as many steps on average (t interval from {low:.1} to {high:.1})",
-                by("pets"),
-                by("sac")
-            ),
-        ),
-        (
-            "README.md",
-            format!(
-                "PETS succeeds in {} of the episodes after 20,000 steps, SAC in {} after 60,000 (t interval of the difference from {from:.0} to {to:.0} percentage points)",
-                success("push", "push", "pets"),
-                success("push", "push", "sac")
-            ),
-        ),
-        ("README.md", format!("about equally smoothly (SPARC {pets:.1} and {sac:.1})")),
-    ]);
-    assert_eq!(["pets", "sac"].map(|method| push(method, "seeds_reaching_80")), [5.0; 2], "all seeds push");
+    for (name, method) in [("PETS (knows the reward)", "pets"), ("TD-MPC2", "tdmpc2"), ("SAC", "sac")] {
+        let [steps, by, seeds, reaching, sparc] =
+            ["steps", "steps_to_80", "seeds", "seeds_reaching_80", "smoothness_sparc"]
+                .map(|column| push(method, column));
+        assert_eq!(seeds, reaching, "all seeds push");
+        let (success, ratio) = (success("push", "push", method), ratio("push", method));
+        let [steps, by] = [steps, by].map(thousands);
+        quotes.push(("README.md", format!("| {name} | {success} | {steps} | {by} ({seeds}) | {ratio} | {sparc:.1} |")));
+    }
+    let difference = |method: &str| {
+        let [low, high] =
+            ["success_minus_sac_t_low", "success_minus_sac_t_high"].map(|column| 100.0 * push(method, column));
+        format!("{low:.0} to {high:.0} percentage points")
+    };
+    let differences = format!("from {} for PETS, and from {} for TD-MPC2", difference("pets"), difference("tdmpc2"));
+    quotes.push(("README.md", differences));
     assert_eq!(test_successes("push", "push", "sac"), [88, 92, 73, 95, 92]);
     let [times, low, high] = sac_steps_ratio("reach", "pets");
     let mean = |method: &str| reach(method, "steps_to_80_restricted_mean");
