@@ -51,6 +51,9 @@ pub enum Error {
     /// A setting with an unusable value, or settings that do not fit together.
     #[error("{0}")]
     Config(String),
+    /// A method that needs something which the task does not have: a scripted policy, snapshots, a known reward.
+    #[error("{0}")]
+    Unsupported(String),
     /// A configuration file or preset that cannot be read.
     #[error("{}: {problem}", .path.display())]
     ConfigFile {

@@ -47,10 +47,10 @@ impl Scripted {
     /// If the task has none, or observations are not compact.
     pub fn of_task(task: Task, options: TableOptions) -> Result<Self> {
         if options.observation != ObservationKind::Compact {
-            return Err(Error::Config("the scripted policies need compact observations".into()));
+            return Err(Error::Unsupported("the scripted policies need compact observations".into()));
         }
         let policy = task.scripted_policy(options);
-        policy.map(Self::new).ok_or_else(|| Error::Config(format!("{task} has no scripted policy")))
+        policy.map(Self::new).ok_or_else(|| Error::Unsupported(format!("{task} has no scripted policy")))
     }
 }
 

@@ -97,7 +97,7 @@ impl<E: Env + Snapshot> Oracle<E> {
     /// The action to take in `state`, in the slot `index` (0 if there is one environment only).
     ///
     /// # Errors
-    /// If the environment refuses a step, for example one beyond its time limit.
+    /// If a step of the environment fails, for example one beyond its time limit.
     pub fn plan(&mut self, index: usize, state: &E::State) -> Result<Vec<f32>> {
         let Self { config, planner, action_size, controllers, simulators, seed } = self;
         let (controller, rng) = controllers.state(index, |index| {
@@ -158,7 +158,7 @@ fn returns<E: Env + Snapshot>(
 
 impl<E: Env + Snapshot> Policy for Oracle<E> {
     /// # Errors
-    /// If a slot's environment is not an `E`, or refuses a step of a plan.
+    /// If a slot's environment is not an `E`, or a step of a plan fails in it.
     fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
         let plan = |slot: &Slot| {
             let env = slot.env.downcast_ref::<E>().ok_or_else(|| {

@@ -49,7 +49,7 @@ pub struct Weights {
 }
 
 impl Weights {
-    /// Adds an array in row-major order; whatever had that name is replaced.
+    /// Adds an array in row-major order. It replaces any entry of that name.
     ///
     /// # Panics
     /// If `shape` does not hold as many numbers.
@@ -94,7 +94,7 @@ impl Weights {
         found.map(|(name, _)| name.as_str())
     }
 
-    /// Adds whole numbers, stored as a U64 tensor; whatever had that name is replaced.
+    /// Adds whole numbers, stored as a U64 tensor. They replace any entry of that name.
     pub fn insert_counts(&mut self, name: impl Into<String>, counts: &[u64]) {
         let name = name.into();
         self.arrays.remove(&name);

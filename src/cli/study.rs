@@ -10,7 +10,7 @@ use indicatif::HumanDuration;
 use super::output::{answer, note};
 use super::progress::Progress;
 use super::{refuse_folder_of, stop_on_ctrl_c};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 use crate::study::run::check_run;
@@ -116,9 +116,8 @@ fn leave_out_what_a_task_lacks(registry: &Registry, plan: &mut StudyPlan) -> Res
         for task in &plan.tasks {
             let config = registry.config(task, &method, 0, None, None)?;
             registry.make_env(&config)?.spec().check()?;
-            let needs = ["scripted", "oracle", "pets"].contains(&config.agent.as_str());
             match registry.method(&config) {
-                Err(problem) if needs => lacks = Some(problem),
+                Err(problem @ Error::Unsupported(_)) => lacks = Some(problem),
                 made => drop(made?),
             }
         }

@@ -109,13 +109,13 @@ impl Pets {
     /// the ensemble learns the reward from experience, and `reward` may be `None`.
     ///
     /// # Errors
-    /// If a setting cannot be used, or the reward is neither known nor learned.
+    /// If a setting cannot be used; [`Error::Unsupported`] if the reward is neither known nor learned.
     pub fn new(spec: &Spec, reward: Option<Arc<DynReward>>, config: PetsConfig, seed: u64) -> Result<Self> {
         config.check_at("pets")?;
         spec.check()?;
         let reward = reward.filter(|reward| reward.is_known());
         if reward.is_none() && !config.ensemble.learn_reward {
-            return Err(Error::Config(format!(
+            return Err(Error::Unsupported(format!(
                 "pets: the reward of `{}` is not known as a function of observations; set `pets.ensemble.learn_reward = true`",
                 spec.name
             )));

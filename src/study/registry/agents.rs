@@ -41,7 +41,7 @@ impl AgentContext<'_> {
 
     fn oracle(&self, config: OracleConfig) -> Result<Method> {
         let make = self.env.oracle.as_ref().ok_or_else(|| {
-            Error::Config(format!(
+            Error::Unsupported(format!(
                 "{} has no oracle: it was not registered `with_oracle`, which needs `Snapshot`",
                 self.env.name
             ))
@@ -52,7 +52,7 @@ impl AgentContext<'_> {
     fn scripted(&self) -> Result<Method> {
         let make = self.env.scripted.as_ref();
         let make = make.ok_or_else(|| {
-            Error::Config(format!("{} has no scripted policy; take another method, such as random", self.env.name))
+            Error::Unsupported(format!("{} has no scripted policy; take another method, such as random", self.env.name))
         })?;
         Ok(Method::fixed(make(self.options)?))
     }

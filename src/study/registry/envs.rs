@@ -165,7 +165,7 @@ impl EnvEntry<Tabletop, TableOptions> {
                 let arm = make(options)?;
                 let policy = arm.scripted_policy();
                 policy.map(Scripted::new).ok_or_else(|| {
-                    Error::Config(format!("{} has no scripted policy for these observations", arm.spec().name))
+                    Error::Unsupported(format!("{} has no scripted policy for these observations", arm.spec().name))
                 })
             })
     }

@@ -147,8 +147,8 @@ impl Registry {
     /// by `steps` if it is given. All defaults are filled in.
     ///
     /// # Errors
-    /// If task or method are unknown, a preset has settings for an unknown task, `seed` or `steps` is too large, the file cannot be read, or a field or value in it is
-    /// wrong.
+    /// If task or method are unknown, a preset has settings for an unknown task, `seed` or `steps` is too large, the file cannot be
+    /// read, or a field or value in it is wrong.
     pub fn config(
         &self,
         task: &str,
@@ -247,7 +247,8 @@ impl Registry {
     /// The method of a run, before it has learned anything.
     ///
     /// # Errors
-    /// If task or agent are unknown, a setting cannot be used, or the agent cannot be used on the task.
+    /// If task or agent are unknown, or a setting cannot be used; [`Error::Unsupported`] if the agent needs something that the task
+    /// does not have.
     pub fn method(&self, config: &RunConfig) -> Result<Method> {
         let (env, agent) = (self.env_entry(&config.task)?, self.agent_entry(&config.agent)?);
         let spec = (env.make)(&config.env)?.spec().clone();

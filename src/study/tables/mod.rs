@@ -162,7 +162,7 @@ impl Tables {
         optional_curves(&self.evaluations, task, method, "return_mean").map_err(inside)
     }
 
-    /// Whether a task is one to be judged by its return: no method ever succeeds in an evaluation, and returns are known.
+    /// Whether to judge a task by its return, because no method succeeds in any evaluation. False if the tables hold no returns.
     ///
     /// # Errors
     /// If the table lacks a column.
