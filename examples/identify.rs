@@ -140,7 +140,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 pushes.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, push)| error(push)).collect();
             mean(&errors)
         };
-        let found = push.seen().identify(GUESS);
+        let found = push.seen().identify(GUESS)?;
         let error = |push: &Push| push.error(&push.seen().play(&found.pusher));
         rows.push(Row {
             learned_from: i,

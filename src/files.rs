@@ -21,16 +21,32 @@ use crate::error::{Error, Result};
 /// # Errors
 /// If the folder cannot be created, or the file cannot be written.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    // A pipe or a device cannot be replaced by a file. (Links to those of a process, as /dev/stdout is one, name no file.)
-    if path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
-        return std::fs::write(path, bytes).map_err(Error::io("write", path));
+    write_all(&[(path, bytes)])
+}
+
+/// Writes several files that belong together: all their bytes are on the disk before the first of them is renamed, so that a full disk
+/// leaves all of the old ones.
+///
+/// # Errors
+/// As [`write`].
+pub(crate) fn write_all(files: &[(&Path, &[u8])]) -> Result<()> {
+    let mut written = Vec::new();
+    for (path, bytes) in files {
+        // A pipe or a device cannot be replaced by a file. (Links to those of a process, as /dev/stdout is one, name no file.)
+        if path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+            std::fs::write(path, bytes).map_err(Error::io("write", path))?;
+            continue;
+        }
+        let path = target(path)?;
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+        let mut file = temporary().tempfile_in(folder).map_err(Error::io("write in", folder))?;
+        file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(Error::io("write", &path))?;
+        written.push((file, path));
     }
-    let path = &target(path)?;
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-    let mut file = temporary().tempfile_in(folder).map_err(Error::io("write in", folder))?;
-    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(Error::io("write", path))?;
-    file.persist(path).map_err(|failed| Error::io("write", path)(failed.error))?;
+    for (file, path) in written {
+        file.persist(&path).map_err(|failed| Error::io("write", &path)(failed.error))?;
+    }
     Ok(())
 }
 

@@ -198,11 +198,21 @@ fn mass_and_friction_are_found_again() {
         };
         state = task.step(&state, &SVector::from([speed, 0.1]));
     }
-    let found = recording.identify(Pusher { mass: 0.15, friction: 0.2, ..truth });
+    let guess = Pusher { mass: 0.15, friction: 0.2, ..truth };
+    let found = recording.identify(guess).expect("a whole recording");
     println!("{found:?}");
     assert!((found.pusher.mass / truth.mass - 1.0).abs() < 0.01, "{found:?}");
     assert!((found.pusher.friction / truth.friction - 1.0).abs() < 0.01, "{found:?}");
     assert!(found.residual < 1e-5, "{found:?}");
+    recording.hand[3][0] = f64::NAN;
+    for (unusable, said) in [
+        (RecordedPush::default(), "0 poses of the hand and 0 of the block"),
+        (RecordedPush { block: vec![[0.0; 3]; 3], hand: vec![[0.0; 2]; 2] }, "2 poses of the hand and 3 of the block"),
+        (recording, "not finite"),
+    ] {
+        let problem = unusable.identify(guess).expect_err(said).to_string();
+        assert!(problem.contains(said), "{problem}");
+    }
 }
 
 /// The best of many first guesses, and a little better at every step: the environment's own pendulum is swung up, whatever it

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use handful::agent::dreamer::ActorCriticConfig;
 use handful::agent::{
-    Agent, Diagnostics, Dreamer, DreamerConfig, Mode, Oracle, OracleConfig, Pets, PetsConfig, Policy, Preset, Sac,
-    SacConfig, Slot, TdMpc2, TdMpc2Config,
+    Agent, Diagnostics, Dreamer, DreamerConfig, Learner, Mode, Oracle, OracleConfig, Pets, PetsConfig, Policy, Preset,
+    Sac, SacConfig, Slot, TdMpc2, TdMpc2Config,
 };
 use handful::checkpoint::Weights;
 use handful::env::{Env, Snapshot, Step, Task, World};
@@ -274,6 +274,41 @@ fn pieces_of_episodes_keep_what_belongs_together() {
         }
     }
     assert!(batch.last.contains(&true));
+}
+
+/// An environment may be reset in the middle of an episode.
+#[test]
+fn a_step_does_not_follow_on_an_episode_that_was_given_up() {
+    let mut buffer = SequenceReplay::new(2, 1, 0);
+    buffer.push(&transition(0.0, false));
+    assert_eq!(buffer.len(), 1, "room for one at least");
+    let mut buffer = SequenceReplay::new(2, 1, 10);
+    buffer.push(&transition(1.0, false));
+    buffer.abandon();
+    buffer.push(&transition(7.0, false));
+    let batch = buffer.sample(1, 2, &mut rng::stream(0, "replay"));
+    assert_eq!((batch.obs[0], batch.obs[2]), (1.0, 7.0));
+    assert_eq!((batch.first, batch.rewards), (vec![true; 2], vec![0.0; 2]));
+    assert!(batch.last[0]);
+    // Both agents that learn from sequences give up what `begin_episode` interrupts.
+    let mut config = DreamerConfig::preset_for("dreamer", "pendulum").expect("a preset");
+    config.warm_up = 300;
+    let mut env = Task::Pendulum.make();
+    let dreamer = Dreamer::new(env.spec(), config, 0).expect("usable settings");
+    let tdmpc2 = TdMpc2::new(env.spec(), TdMpc2Config::preset_for("tdmpc2", "pendulum").expect("a preset"), 0);
+    let agents: [Box<dyn Learner>; 2] = [Box::new(dreamer), Box::new(tdmpc2.expect("usable settings"))];
+    for mut agent in agents {
+        for seed in 0..2 {
+            let obs = env.reset(seed);
+            agent.begin_episode();
+            let action = agent.act(&obs, Mode::Explore);
+            let Step { observation: next_obs, reward, .. } = env.step(&action).expect("a valid action");
+            agent.observe(&Transition { obs, action, reward, next_obs, terminated: false, truncated: false });
+        }
+        let mut replay = SequenceReplay::new(3, 1, 10);
+        replay.load(&agent.training_state(), "replay").expect("two time steps");
+        assert_eq!(replay.sample(1, 2, &mut rng::stream(0, "replay")).first, [true, true]);
+    }
 }
 
 /// Slices within episodes, also where episodes are so short that most starts lead out of them, and of an episode that was cut

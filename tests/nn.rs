@@ -70,24 +70,37 @@ fn matmul_reads_transposed_matrices() {
 #[test]
 fn a_layer_does_not_depend_on_the_number_of_threads() {
     let mut rng = rng::stream(0, "threads");
-    let shape = DenseShape { members: 1, batch: 301, input: 77, output: 129, shared_input: true };
-    let (x, w, b) = (numbers(301 * 77, &mut rng), numbers(77 * 129, &mut rng), numbers(129, &mut rng));
-    let with = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
-        pool.install(|| {
-            let (mut y, mut before, mut dx) = (vec![0.0; 301 * 129], vec![0.0; 301 * 129], vec![0.0; 301 * 77]);
-            let (mut dw, mut db) = (vec![0.0; 77 * 129], vec![0.0; 129]);
-            kernels::dense(&mut y, Some(&mut before), &x, &w, &b, shape, Activation::Relu);
-            assert!(y.iter().zip(&before).all(|(y, before)| *y == before.max(0.0)));
-            kernels::dense(&mut before, None, &x, &w, &b, shape, Activation::Relu);
-            assert_eq!(y, before);
-            kernels::dense_input_gradient(&mut dx, &y, &w, shape);
-            kernels::dense_parameter_gradients(&mut dw, &mut db, &x, &y, shape);
-            [y, dx, dw, db].concat().iter().map(|v: &f32| v.to_bits()).collect::<Vec<u32>>()
-        })
-    };
-    assert_eq!(with(1), with(2));
-    assert_eq!(with(1), with(5));
+    // With 203 rows in tasks of 201, two would be left over.
+    for batch in [301, 203] {
+        let shape = DenseShape { members: 1, batch, input: 77, output: 129, shared_input: true };
+        let (x, w, b) = (numbers(batch * 77, &mut rng), numbers(77 * 129, &mut rng), numbers(129, &mut rng));
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+            pool.install(|| {
+                let (mut y, mut before, mut dx) =
+                    (vec![0.0; batch * 129], vec![0.0; batch * 129], vec![0.0; batch * 77]);
+                let (mut dw, mut db) = (vec![0.0; 77 * 129], vec![0.0; 129]);
+                kernels::dense(&mut y, Some(&mut before), &x, &w, &b, shape, Activation::Relu);
+                assert!(y.iter().zip(&before).all(|(y, before)| *y == before.max(0.0)));
+                kernels::dense(&mut before, None, &x, &w, &b, shape, Activation::Relu);
+                assert_eq!(y, before);
+                kernels::dense_input_gradient(&mut dx, &y, &w, shape);
+                kernels::dense_parameter_gradients(&mut dw, &mut db, &x, &y, shape);
+                [y, dx, dw, db].concat().iter().map(|v: &f32| v.to_bits()).collect::<Vec<u32>>()
+            })
+        };
+        assert_eq!(with(1), with(2));
+        assert_eq!(with(1), with(5));
+    }
+}
+
+#[test]
+fn what_is_not_a_number_stays_so() {
+    for activation in [Activation::Identity, Activation::Relu, Activation::Silu, Activation::Mish] {
+        let mut y = [f32::NAN, -1.0];
+        kernels::add_and_activate(&mut y, &[0.0, 0.0], activation);
+        assert!(y[0].is_nan() && !y[1].is_nan(), "{activation:?}: {y:?}");
+    }
 }
 
 #[test]

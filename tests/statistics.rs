@@ -17,9 +17,9 @@ use handful::study::runner::{Budget, Profile, StudyPlan};
 use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
-    area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
-    probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean, steps_to, t_interval,
-    two_level_bootstrap, welch_interval, wilson,
+    Time, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
+    probability_of_being_earlier, probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean,
+    steps_to, t_interval, two_level_bootstrap, welch_interval, wilson,
 };
 use rayon::prelude::*;
 
@@ -119,8 +119,8 @@ fn success_curves() {
     // By the evaluation where it is reached, not by a step between two.
     assert_eq!(steps_to(0.8, &steps, &success), Some(40.0));
     assert_eq!(steps_to(0.8, &[0.0, 500.0, 1000.0], &[0.0, 1.0, 1.0]), Some(500.0));
-    assert_eq!(steps_to(0.95, &steps, &success), Some(50.0), "the last evaluation has no next one");
-    assert_eq!(steps_to(0.96, &steps, &success), None);
+    assert_eq!(steps_to(0.95, &steps, &success), None, "the last evaluation has no next one");
+    assert_eq!(steps_to(0.9, &steps, &success), Some(40.0));
     assert_eq!(steps_to(0.8, &steps, &[0.0, 0.9, 0.5, 0.8, 0.8, 0.1]), Some(30.0), "one high evaluation is not enough");
 }
 
@@ -134,11 +134,19 @@ fn censored_times() {
     assert_eq!(means, [102.0, 60.0]);
     assert_eq!(censored_median(&[Some(60.0), None, None]), None, "the median is censored itself");
     // The second is earlier in 22 of 25 pairs.
-    let sooner = |times: &[Option<f64>]| times.iter().map(|t| -t.unwrap_or(f64::INFINITY)).collect::<Vec<f64>>();
+    let within = |times: &[Option<f64>], budget| {
+        times.iter().map(|time| time.map_or(Time::Censored(budget), Time::Reached)).collect::<Vec<Time>>()
+    };
     let mut rng = rng::stream(0, "ratio test");
-    let (earlier, [low, high]) = probability_of_improvement(&sooner(&second), &sooner(&first), &mut rng);
+    let (earlier, [low, high]) =
+        probability_of_being_earlier(&within(&second, 150.0), &within(&first, 150.0), &mut rng);
     near("earlier", earlier, 0.88, 1e-12);
     assert!(low < 0.88 && low > 0.4 && high == 1.0, "{low} {high}");
+    // Within a budget of 60, the last seed of the first may be earlier than those of the second that took 70 and 90.
+    let (earlier, _) = probability_of_being_earlier(&within(&second, 150.0), &within(&[None], 60.0), &mut rng);
+    near("earlier than one that is censored before", earlier, (3.0 + 2.0 / 2.0) / 5.0, 1e-12);
+    let later = probability_of_being_earlier(&within(&[None], 60.0), &within(&second, 150.0), &mut rng).0;
+    near("both ways", earlier + later, 1.0, 1e-12);
     assert_eq!(probability_of_improvement(&[1.0], &[1.0, 1.0], &mut rng), (0.5, [0.5; 2]));
     let (ratio, [low, high]) =
         ratio_of_means(&[60.0, 80.0, 100.0, 120.0, 150.0], &[40.0, 50.0, 50.0, 70.0, 90.0], &mut rng);
@@ -185,6 +193,14 @@ fn t_intervals() {
     near("low", low, 0.67 - 2.776_445 * 0.292_831 / 5.0_f64.sqrt(), 1e-4);
     near("high", high, 0.67 + 2.776_445 * 0.292_831 / 5.0_f64.sqrt(), 1e-4);
     assert_eq!(t_interval(&[0.5]), None, "one seed says nothing about others");
+    // More seeds than there are quantiles in a table: of the variance n / (n - 1), the mean's is 1 / (n - 1).
+    for (n, quantile) in [(11, 2.228_139), (12, 2.200_985), (32, 2.039_513), (102, 1.983_731)] {
+        let seeds: Vec<f64> = (0..n - n % 2).map(|i| if i % 2 == 0 { 1.0 } else { -1.0 }).collect();
+        let seeds = if n % 2 == 0 { seeds } else { [seeds, vec![0.0]].concat() };
+        let spread = seeds.iter().map(|x| x * x).sum::<f64>() / f64::from(n) / f64::from(n - 1);
+        let [low, high] = t_interval(&seeds).expect("many seeds");
+        near("quantile", (high - low) / 2.0 / spread.sqrt(), quantile, 4e-4);
+    }
 }
 
 #[test]
@@ -223,23 +239,22 @@ fn t_intervals_of_two_methods() {
     assert_eq!(welch_interval(&first, &[0.5]), None, "one seed says nothing about others");
 }
 
-/// A study by hand: `dreamer` with five seeds, one of which fails, `pets` with two, `sac` with one.
-#[test]
-fn a_summary_says_what_its_seeds_can_tell() {
+/// A method in a study by hand: its name, the successes of each seed in 20 episodes, from which step on, and the steps between
+/// evaluations and of the last one.
+type ByHand = (&'static str, &'static [usize], usize, [usize; 2]);
+
+/// The folder of a study of these methods, with its report.
+fn study_by_hand(methods: &[ByHand]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     let mut tests = String::from("task,method,seed,episode,return,success,length,stage,sparc,ldlj\n");
     let mut evaluations = String::from("task,method,seed,step,episodes,success,action_ms,seconds\n");
-    for (method, successes, every, last) in [
-        ("dreamer", vec![20, 20, 20, 0, 20], 500, 2000),
-        ("pets", vec![20, 20], 500, 1000),
-        ("sac", vec![10], 1000, 2000),
-    ] {
-        for (seed, successes) in successes.into_iter().enumerate() {
+    for (method, seeds, from, [every, last]) in methods {
+        for (seed, successes) in seeds.iter().enumerate() {
             for i in 0..20 {
-                tests += &format!("pole,{method},{seed},{},-1.5,{},200,0,,\n", i + 1, i < successes);
+                tests += &format!("pole,{method},{seed},{},-1.5,{},200,0,,\n", i + 1, i < *successes);
             }
-            for step in (0..=last).step_by(every) {
-                let success = if step >= 1000 { successes as f64 / 20.0 } else { 0.0 };
+            for step in (0..=*last).step_by(*every) {
+                let success = if step >= *from { *successes as f64 / 20.0 } else { 0.0 };
                 let seconds = step as f64 / 100.0 + seed as f64;
                 evaluations += &format!("pole,{method},{seed},{step},20,{success:?},{}.5,{seconds}\n", step / 1000);
             }
@@ -249,6 +264,49 @@ fn a_summary_says_what_its_seeds_can_tell() {
         std::fs::write(folder.path().join(name).with_extension("csv"), text).expect("a writable folder");
     }
     handful::study::report::write(folder.path(), folder.path()).expect("a study");
+    folder
+}
+
+fn report_in(folder: &Path) -> String {
+    std::fs::read_to_string(folder.join("report.md")).expect("a report")
+}
+
+/// Four seeds are the fewest that an exact rank test can tell from four others.
+#[test]
+fn a_verdict_needs_four_seeds() {
+    let of = |seeds: &'static [usize]| {
+        let folder = study_by_hand(&[("pets", seeds, 500, [500, 2000]), ("sac", &[10, 12, 11, 10], 500, [500, 2000])]);
+        report_in(folder.path())
+    };
+    let (four, three) = (of(&[20, 19, 20, 20]), of(&[20, 19, 20]));
+    assert!(four.contains("Significantly more test success than `sac`: `pets`."), "{four}");
+    assert!(three.contains("Fewer than 4 seeds, too few for a test against `sac`: `pets`."), "{three}");
+    let (fast, slow): (ByHand, ByHand) = (("pets", &[20; 4], 500, [500, 2000]), ("sac", &[20; 4], 1500, [500, 2000]));
+    let folder = study_by_hand(&[fast, slow]);
+    let report = report_in(folder.path());
+    assert!(report.contains("Significantly fewer steps to 80 % than `sac`: `pets`."), "{report}");
+    assert!(report.contains("+0 percentage points, without an interval"), "{report}");
+    // Nobody else was compared.
+    assert!(
+        report.contains("`pets` is told the reward function; of the methods that are not, `sac` is first"),
+        "{report}"
+    );
+    let alone = study_by_hand(&[fast]);
+    assert!(report_in(alone.path()).contains("`pets` is told the reward function.\n"));
+    // Who succeeds without training takes no steps: there is no ratio.
+    let at_once: ByHand = ("pets", &[20; 4], 0, [500, 2000]);
+    let report = report_in(study_by_hand(&[at_once, slow]).path());
+    assert!(!report.contains("times as many steps"), "{report}");
+}
+
+/// `dreamer` with five seeds, one of which fails, `pets` with two, `sac` with one.
+#[test]
+fn a_summary_says_what_its_seeds_can_tell() {
+    let folder = study_by_hand(&[
+        ("dreamer", &[20, 20, 20, 0, 20], 1000, [500, 2000]),
+        ("pets", &[20, 20], 500, [500, 1000]),
+        ("sac", &[10], 1000, [1000, 2000]),
+    ]);
     let tables = handful::study::tables::Tables::read(folder.path()).expect("a study");
     let value = |method: &str, column: &str| tables.value("pole", method, column).expect("a column");
     // Resampled seeds: none of five fails in a third of the draws, three or more in 6 %.
@@ -272,9 +330,9 @@ fn a_summary_says_what_its_seeds_can_tell() {
     assert_eq!(value("sac", "steps_to_80_restricted_mean"), Some(2000.0));
     // Areas end where the shortest budget does.
     assert_eq!(value("dreamer", "common_budget"), Some(1000.0));
-    assert_eq!(value("pets", "area_under_curve"), Some(0.25));
+    assert_eq!(value("pets", "area_under_curve"), Some(0.75));
     assert_eq!(value("pets", "success_minus_sac"), Some(0.5));
-    assert_eq!((value("pets", "sac_steps_ratio"), value("dreamer", "sac_steps_ratio")), (Some(2.0), None));
+    assert_eq!((value("pets", "sac_steps_ratio"), value("dreamer", "sac_steps_ratio")), (Some(4.0), None));
     assert_eq!(value("sac", "success_minus_sac"), None);
     // Four of five seeds have more success, and are earlier; the fifth ties in that neither gets there.
     assert_eq!(
@@ -286,22 +344,23 @@ fn a_summary_says_what_its_seeds_can_tell() {
         (value("pets", "updates"), value("pets", "action_change"), value("pets", "optimism")),
         (None, None, None)
     );
-    let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
+    let report = report_in(folder.path());
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
         "| 1000 (12 s) | 2.5 |",
-        "- **pole**\n  - `dreamer` and `pets` are first at 80 % success, by step 1000 (median). `pets` is told the reward function.\n  - Significantly fewer steps to 80 % than `sac`: \
-         `pets`. Not every seed gets there within the budget, so no ratio to `sac`: `dreamer`.\n  - Significantly more success in the \
-         test than `sac`: `pets`. No significant difference in the test from `sac`: `dreamer`.\n",
+        "- **pole**\n  - `pets` is first to reach 80 % success, by step 500 (median). `pets` is told the reward function; of the \
+         methods that are not, `dreamer` is first, by step 1000.\n  - Not every seed reaches 80 % within its budget, so no ratio of \
+         steps to `sac`: `dreamer`. Fewer than 4 seeds, too few for a test against `sac`: `pets`.\n  - Fewer than 4 seeds, too few for a test \
+         against `sac`: `dreamer`, `pets`.\n",
         "one seed: the interval covers its test episodes, not what another seed would bring",
         "minus that of `sac`: +50 percentage points [",
-        "takes at least 2.0 times as many steps",
+        "takes at least 4.0 times as many steps",
         "**Not evaluated alike:** `dreamer` every 500 steps with 20 episodes",
         "`sac` every 1000 steps",
         "| 0.80 [0.40, 1.00] | 0.90 [0.70, 1.00] |",
-        "- **no**: each learning method of a task has at least five seeds. Not: `pets` on `pole` has 2; `sac` on `pole` has 1.",
-        "- **no**: all learning methods of a task have the same seeds. Not: `pets` on `pole` without 2, 3, 4; `sac` on `pole` without 1, 2, 3, 4.",
-        "Not: it is not recorded.",
+        "- **no**: each learning method of a task has at least five seeds. Exceptions: `pets` on `pole` has 2; `sac` on `pole` has 1.",
+        "- **no**: all learning methods of a task have the same seeds. Exceptions: `pets` on `pole` lacks 2, 3, 4; `sac` on `pole` lacks 1, 2, 3, 4.",
+        "Exceptions: the version is not recorded.",
     ] {
         assert!(report.contains(part), "no `{part}` in: {report}");
     }

@@ -310,6 +310,7 @@ fn the_reward_in_logarithm_pulls_from_afar() {
 fn bad_actions_are_refused_and_change_nothing() {
     for task in Task::ALL {
         let (mut env, mut untouched) = (task.make(), task.make());
+        assert_eq!(env.scene().len(), env.poses().len(), "{task}: also before the first reset");
         env.reset(0);
         untouched.reset(0);
         let size = env.spec().action_size;
@@ -321,6 +322,14 @@ fn bad_actions_are_refused_and_change_nothing() {
         assert!(matches!(env.step(&vec![0.0; size + 1]), Err(Error::Action { .. })));
         let good = vec![0.5; size];
         assert_eq!(bits(&env.step(&good).expect("valid")), bits(&untouched.step(&good).expect("valid")), "{task}");
+    }
+}
+
+#[test]
+fn the_arm_does_not_move_before_the_first_reset() {
+    for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door] {
+        let said = task.make().step(&[0.0; 4]).expect_err("no episode").to_string();
+        assert!(said.contains("before the first reset"), "{said}");
     }
 }
 

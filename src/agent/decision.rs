@@ -23,6 +23,11 @@ impl Held {
         self.action.clone()
     }
 
+    /// Whether the next time step needs a decision.
+    pub fn is_due(&self) -> bool {
+        self.left == 0
+    }
+
     /// The action before the next decision: `size` zeros before the first one of an episode.
     pub fn last(&self, size: usize) -> Vec<f32> {
         if self.action.is_empty() { vec![0.0; size] } else { self.action.clone() }

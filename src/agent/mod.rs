@@ -71,7 +71,7 @@ pub type Losses = BTreeMap<&'static str, f32>;
 /// An imagined trajectory: one rollout of a learned model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImaginedTrajectory {
-    /// Predicted observations, `[horizon + 1][observation]`; the first is the present one.
+    /// Predicted observations, `[horizon + 1][observation]`; the first is the present one, or a latent model's reconstruction of it.
     pub observations: Vec<Vec<f32>>,
     /// The predicted return.
     pub value: f32,
@@ -82,7 +82,8 @@ pub struct ImaginedTrajectory {
 /// An estimate of the return from one time step of an episode on, beside the return that followed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ValueEstimate {
-    /// The estimate: of the discounted sum of rewards from this time step on, or of their sum over the horizon of a plan.
+    /// The estimate: of the discounted sum of rewards from this time step on, or of their sum over the horizon of a plan. SAC's is a soft
+    /// value, which also contains the entropies of later actions.
     pub expected: f32,
     /// The same sum of the rewards that followed. After a truncation, the discounted sum is bootstrapped from the estimate at
     /// the last time step.
@@ -113,7 +114,9 @@ impl ValueEstimate {
 /// One step of training is `act`, a step of the environment, `observe`, `update`; `begin_episode` comes after each
 /// reset of the environment.
 pub trait Agent: Send {
-    /// A new episode begins: clears what the agent remembers of the one before (a recurrent state, a plan).
+    /// A new episode begins, both in the environment that it learns in and in the one that [`Agent::act`] evaluates in: clears what the
+    /// agent remembers of the one before (a recurrent state, a plan, a held action). [`Agent::act_batch`] evaluates in the middle of a
+    /// training episode without touching it.
     fn begin_episode(&mut self) {}
 
     /// Chooses an action, each component in [-1, 1].

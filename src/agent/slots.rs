@@ -70,6 +70,11 @@ impl<S> Slots<S> {
         self.states[index].get_or_insert_with(|| fresh(index))
     }
 
+    /// The state of an index, if it has one.
+    pub fn existing(&self, index: usize) -> Option<&S> {
+        self.states.get(index)?.as_ref()
+    }
+
     /// Drops the state of an index: its next one is fresh.
     pub fn clear(&mut self, index: usize) {
         if let Some(state) = self.states.get_mut(index) {

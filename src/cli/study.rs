@@ -20,10 +20,10 @@ use crate::study::status::{RunState, RunStatus, status, time_left};
 
 #[derive(clap::Args)]
 pub(super) struct Args {
-    /// How much to take on
+    /// Size of the study
     #[arg(long, value_enum, default_value_t = ProfileArg::Quick)]
     profile: ProfileArg,
-    /// Tasks, separated by commas
+    /// Tasks, separated by commas; each then has the full budget of its presets, also in the quick profile
     #[arg(long, value_delimiter = ',')]
     tasks: Option<Vec<String>>,
     /// Methods, separated by commas
@@ -32,7 +32,7 @@ pub(super) struct Args {
     /// How many seeds, or a range like 0..5
     #[arg(long, value_parser = seed_range, allow_negative_numbers = true)]
     seeds: Option<Range<u64>>,
-    /// Where the runs are measured: test, or development for runs that help to choose settings
+    /// Initial states of evaluations and test: test, or development for tuning
     #[arg(long)]
     starts: Option<Starts>,
     /// Runs at a time; as many as there are cores if left out
@@ -41,7 +41,7 @@ pub(super) struct Args {
     /// Where to write everything [default: runs/PROFILE]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Carry nothing out: say how far the runs are, also while another process works on them
+    /// Run nothing; print how far the runs are, also while another process works on them
     #[arg(long)]
     status: bool,
 }

@@ -25,7 +25,7 @@ pub(super) struct Args {
     /// The seed of everything random
     #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
-    /// Where the run is measured: test, or development for a run that helps to choose settings
+    /// Initial states of evaluations and test: test, or development for tuning
     #[arg(long)]
     starts: Option<Starts>,
     /// A TOML file with settings that differ from the preset

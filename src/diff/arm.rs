@@ -106,6 +106,9 @@ impl<S: RealField + Copy> FreeArm<S> {
 
     /// The state after a control step. The action is that of [`crate::env::tabletop::ActionKind::Hand`] without the gripper: where
     /// the goal of the hand lies, seen from the hand.
+    ///
+    /// # Panics
+    /// If a number in state or action is not finite.
     pub fn step(&self, state: &SVector<S, STATE>, action: &Vector3<S>) -> SVector<S, STATE> {
         let mut q: SVector<S, JOINTS> = state.fixed_rows::<JOINTS>(0).into();
         let mut qd: SVector<S, JOINTS> = state.fixed_rows::<JOINTS>(JOINTS).into();

@@ -8,6 +8,8 @@ use nalgebra::{Const, SVector, Vector2};
 use num_dual::{Derivative, DualSVec64};
 
 use super::least_squares::{Found, Residuals, direction, minimise};
+use crate::error::{Error, Result};
+
 use super::pusher::{DT, HALF, Pusher, SPEED, STATE};
 
 /// Standard deviation of the error of a pose that no simulator explains, m: the weight of the recording against the prior.
@@ -53,17 +55,32 @@ pub struct Identified {
 impl RecordedPush {
     /// Estimates mass and friction near `guess`, whose other parameters are kept. The block starts at rest. The error of a whole
     /// trajectory has local minima, so the search starts nine times: from the guess, and a factor of three above and below.
-    pub fn identify(&self, guess: Pusher<f64>) -> Identified {
+    ///
+    /// # Errors
+    /// If there are fewer than two poses, hand and block do not have equally many, or a number is not finite.
+    pub fn identify(&self, guess: Pusher<f64>) -> Result<Identified> {
+        let (hands, blocks) = (self.hand.len(), self.block.len());
+        if hands < 2 || hands != blocks {
+            return Err(Error::Config(format!(
+                "the recorded push has {hands} poses of the hand and {blocks} of the block; it needs equally many, at least two"
+            )));
+        }
+        if self.hand.iter().flatten().chain(self.block.iter().flatten()).any(|x| !x.is_finite()) {
+            return Err(Error::Config("the recorded push has a number that is not finite; leave its pose out".into()));
+        }
         const FACTORS: [f64; 3] = [1.0, 1.0 / 3.0, 3.0];
         let beginnings = FACTORS.iter().flat_map(|mass| FACTORS.map(|friction| Vector2::new(mass.ln(), friction.ln())));
         let found = beginnings.map(|off| minimise(off, |off| self.residuals(&guess, off)));
         let Found { off, deviations, residual, iterations, .. } =
             found.min_by(|a, b| a.square.total_cmp(&b.square)).expect("several beginnings");
         let pusher = Pusher { mass: guess.mass * off[0].exp(), friction: guess.friction * off[1].exp(), ..guess };
-        Identified { pusher, deviations, residual, iterations }
+        Ok(Identified { pusher, deviations, residual, iterations })
     }
 
     /// The poses that the block of `pusher` has under the recorded motion of the hand.
+    ///
+    /// # Panics
+    /// If there is no pose of the hand, or none of the block.
     pub fn play(&self, pusher: &Pusher<f64>) -> Vec<[f64; 3]> {
         self.poses(pusher)
     }

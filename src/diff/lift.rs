@@ -107,6 +107,9 @@ impl RecordedLift {
         if let Some(t) = self.joints.iter().enumerate().find_map(finite) {
             return Err(Error::Config(format!("joint state {t} of the recorded lift is not finite; leave it out")));
         }
+        if let Some(t) = self.actions.iter().position(|action| action.iter().any(|a| !a.is_finite())) {
+            return Err(Error::Config(format!("action {t} of the recorded lift is not finite; leave its step out")));
+        }
         let arm = arm.cast::<Dual64>();
         let found = minimise(Vector1::zeros(), |off| self.residuals(&arm, guess, off));
         let factor = found.off[0].exp();

@@ -169,7 +169,7 @@ impl PusherTask {
     pub fn guess(&self, start: &SVector<f64, STATE>, steps: usize) -> Vec<SVector<f64, 2>> {
         const ROUND: f64 = 3.5 * HALF;
         let (mut hand, block) = (Vector2::new(start[0], start[1]), Vector2::new(start[2], start[3]));
-        let way = (Vector2::from(self.goal) - block).normalize();
+        let way = (Vector2::from(self.goal) - block).try_normalize(0.0).unwrap_or_else(Vector2::x);
         let mut pushing = false;
         let step = |_| {
             let off = hand - block;
@@ -195,10 +195,10 @@ impl PusherTask {
         (state[2] - self.goal[0]).hypot(state[3] - self.goal[1])
     }
 
+    /// Squared distance of the block from its goal, dm^2.
     fn error<S: RealField + Copy>(&self, state: &SVector<S, STATE>) -> S {
         let number = nalgebra::convert::<f64, S>;
         let (x, y) = (state[2] - number(self.goal[0]), state[3] - number(self.goal[1]));
-        // In decimetres.
         number(100.0) * (x * x + y * y)
     }
 }

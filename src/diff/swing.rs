@@ -9,7 +9,8 @@ use crate::env::{cartpole, pendulum};
 use crate::rng::{Rng, uniform};
 
 /// The pendulum: angle from upright (rad) and angular velocity (rad/s); the action is a torque divided by 2 N m. The cost is
-/// smooth where the environment's has a kink as the angle wraps; near upright and hanging the two are close.
+/// smooth where the environment's has a kink as the angle wraps: 5 (1 - cos angle) instead of angle^2. Both are zero upright and about 10
+/// hanging; near upright this one is 2.5 times as large.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct PendulumSwing;
 

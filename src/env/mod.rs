@@ -233,7 +233,11 @@ pub trait KnownReward {
     /// # Panics
     /// If the lengths do not fit together.
     fn rewards(&self, obs: &[f32], actions: &[f32], next_obs: &[f32], rewards: &mut [f32]) {
-        let n = rewards.len().max(1);
+        let n = rewards.len();
+        if n == 0 {
+            assert!(obs.is_empty() && actions.is_empty() && next_obs.is_empty());
+            return;
+        }
         assert!(obs.len() == next_obs.len() && obs.len().is_multiple_of(n) && actions.len().is_multiple_of(n));
         let rows = obs.chunks(obs.len() / n).zip(actions.chunks(actions.len() / n)).zip(next_obs.chunks(obs.len() / n));
         for (reward, ((obs, action), next)) in rewards.iter_mut().zip(rows) {

@@ -53,7 +53,7 @@ pub struct Feature {
     /// The cube whose orientation it belongs to, if any. Six consecutive features give a cube's orientation: the directions
     /// of its x-axis and of its z-axis. A cube looks the same from every side, and models may make use of that symmetry.
     pub cube: Option<String>,
-    /// Whether it is a flag, 0 or 1. Models predict a flip in full, however rare it is.
+    /// Whether it is a flag, 0 or 1. Ensembles do not clip a flag's training target, so that they predict even a rare flip in full.
     pub flag: bool,
 }
 

@@ -82,7 +82,7 @@ pub trait OpenLoopModel {
 }
 
 /// Evaluates a model on held-out episodes of the environment with this `spec`, one row for each of the [`HORIZONS`] that is no
-/// longer than the longest episode; no rows without episodes.
+/// longer than the longest episode and over which some feature moves differently from start to start; no rows without episodes.
 #[doc(alias = "open loop")]
 pub fn open_loop(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
     let longest = episodes.iter().map(|episode| episode.actions.len()).max().unwrap_or(0);
@@ -101,7 +101,7 @@ pub fn open_loop(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], 
         .filter(|(_, feature)| feature.role == Role::Dynamic && feature.cube.is_none())
         .map(|(i, feature)| (i, feature.scale))
         .collect();
-    horizons.into_iter().map(|k| evaluate(&features, &starts, &predictions[k], k)).collect()
+    horizons.into_iter().filter_map(|k| evaluate(&features, &starts, &predictions[k], k)).collect()
 }
 
 /// The recorded actions of `horizon` time steps from a start, one after the other.
@@ -177,8 +177,13 @@ impl OpenLoopModel for Propagated<'_> {
     }
 }
 
-/// Compares predictions over `k` time steps, `[particles, starts, observation]`, with the episodes.
-fn evaluate(features: &[(usize, f32)], starts: &[(&Episode, usize)], predictions: &[f32], k: usize) -> OpenLoop {
+/// Compares predictions over `k` time steps, `[particles, starts, observation]`, with the episodes. None if there is nothing to compare.
+fn evaluate(
+    features: &[(usize, f32)],
+    starts: &[(&Episode, usize)],
+    predictions: &[f32],
+    k: usize,
+) -> Option<OpenLoop> {
     let width = starts[0].0.observations[0].len();
     let particles_of_each = predictions.len() / width / starts.len();
     let mut squares = vec![0.0; starts.len()];
@@ -204,18 +209,21 @@ fn evaluate(features: &[(usize, f32)], starts: &[(&Episode, usize)], predictions
             log_units += unit.ln();
         }
     }
-    let mut errors: Vec<f64> = squares.iter().map(|square| (square / f64::from(compared.max(1))).sqrt()).collect();
+    if compared == 0 {
+        return None;
+    }
+    let mut errors: Vec<f64> = squares.iter().map(|square| (square / f64::from(compared)).sqrt()).collect();
     errors.sort_by(f64::total_cmp);
     let quantile = |q: f64| errors[(q * (errors.len() - 1) as f64).round() as usize];
-    let count = forecasts.len().max(1) as f64;
+    let count = forecasts.len() as f64;
     let uncertain = particles_of_each > 1;
-    OpenLoop {
+    Some(OpenLoop {
         horizon: k,
         rmse: quantile(0.5),
         nll: uncertain.then(|| (forecasts.iter().map(GaussianForecast::nll).sum::<f64>() - log_units) / count),
         coverage90: uncertain.then(|| coverage(&forecasts, 0.9)),
         rmse_p90: quantile(0.9),
-    }
+    })
 }
 
 /// Population standard deviation.
@@ -287,6 +295,16 @@ mod tests {
                 "after {k} steps {future:?}, not {expected:?}"
             );
         }
+    }
+
+    /// Of one start, every displacement is the same.
+    #[test]
+    fn nothing_is_said_where_nothing_differs() {
+        let spec = Spec::new("test", [Feature::new("x")], 1, 5, 0.1);
+        let observations = (0..=5).map(|t| vec![t as f32]).collect();
+        let episode = Episode { observations, actions: vec![vec![0.0]; 5], ..Episode::default() };
+        let rows = open_loop(&KnowsTheFirst, &spec, &[episode], &mut rng::stream(0, "starts"));
+        assert!(rows.is_empty(), "{rows:?}");
     }
 
     #[test]

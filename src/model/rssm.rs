@@ -36,7 +36,7 @@ use crate::nn::norm::RmsNorm;
 use crate::nn::recurrent::gru;
 use crate::nn::{BlockDense, Categorical, Grad, Mlp, TapeOps, Tensor3, ops, parameters_of_fields, tensor, values};
 use crate::rng::Rng;
-use crate::settings::{fits, ranges};
+use crate::settings::{fits, must_hold, ranges};
 
 /// Sizes of an [`Rssm`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -155,7 +155,11 @@ parameters_of_fields!(
 
 impl Rssm {
     /// A new model for actions of dimension `actions` and encoded observations of dimension `token`.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn new(cpu: &Cpu, config: &RssmConfig, actions: usize, token: usize, rng: &mut Rng) -> Self {
+        must_hold(config, "rssm");
         let RssmConfig { deter, blocks, hidden, .. } = *config;
         let stoch = config.stoch_size();
         let mut mlp = |input, layers: usize, output| Mlp::dreamer(cpu, input, &vec![hidden; layers], output, rng);

@@ -123,8 +123,11 @@ ranges!(enum Risk {
 });
 
 impl Risk {
-    /// The score of these returns.
+    /// The score of these returns; NaN if one of them is, or if there are none.
     pub fn of(self, returns: &[f32]) -> f32 {
+        if returns.is_empty() || returns.iter().any(|r| r.is_nan()) {
+            return f32::NAN;
+        }
         let n = returns.len() as f32;
         let mean = returns.iter().sum::<f32>() / n;
         match self {
@@ -185,6 +188,13 @@ mod tests {
         let distant = [vec![0.0; 100], vec![100.0; 100]];
         let found = jensen_renyi(&distant, &vec![vec![1e-4; 100]; 2]);
         near(found, 2.0_f64.ln());
+    }
+
+    #[test]
+    fn what_is_not_a_number_has_no_risk() {
+        for risk in [Risk::Neutral, Risk::MeanStd(0.5), Risk::Cvar(0.2), Risk::Entropic(0.5)] {
+            assert!(risk.of(&[]).is_nan() && risk.of(&[1.0, f32::NAN, 2.0, 3.0, 4.0]).is_nan(), "{risk:?}");
+        }
     }
 
     #[test]

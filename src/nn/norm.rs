@@ -13,7 +13,7 @@
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
-use super::kernels::{Activation, mish, mish_slope, silu, silu_slope, vectorised_fn};
+use super::kernels::{Activation, mish, mish_slope, relu, silu, silu_slope, vectorised_fn};
 use super::ops::{Grad, Tensor3, take, values};
 use super::parameters::Parameters;
 use super::tape::TapeOps;
@@ -116,8 +116,8 @@ fn normalised<T: Tape<f32, Cpu>>(
             let dy = take(gradients, &y)?;
             let mut d_gain = take(gradients, &gain)?;
             let mut d_shift = match &shift {
-                Some(shift) => take(gradients, shift)?,
-                None => vec![0.0; members * features],
+                Some(shift) if grad != Grad::Input => take(gradients, shift)?,
+                _ => vec![0.0; members * features],
             };
             let dx = gradients.get_or_alloc_mut(&x)?;
             for (member, dx) in dx.chunks_exact_mut(batch * features).enumerate() {
@@ -158,7 +158,7 @@ vectorised_fn! {
     ) {
         match rule.activation {
             Activation::Identity => forward_rows(y, statistics, x, gain, shift, rule, |z| z),
-            Activation::Relu => forward_rows(y, statistics, x, gain, shift, rule, |z| z.max(0.0)),
+            Activation::Relu => forward_rows(y, statistics, x, gain, shift, rule, relu),
             Activation::Silu => forward_rows(y, statistics, x, gain, shift, rule, silu),
             Activation::Mish => forward_rows(y, statistics, x, gain, shift, rule, mish),
         }

@@ -328,9 +328,11 @@ pub fn mean(x: &Tensor3) -> f32 {
     numbers.iter().sum::<f32>() / numbers.len() as f32
 }
 
-/// The sum of the means of several losses `[1, batch, 1]`, each times a weight: what is differentiated.
+/// The sum of several losses `[members, batch, 1]`, each times a weight: what is differentiated. The loss of a network is its mean over
+/// the batch; those of several networks are added, so that the gradient of each is the same as if it were alone.
 pub fn total<T: Tape<f32, Cpu>>(mut tape: T, losses: &[(f32, Tensor3)]) -> Tensor<Rank0, f32, Cpu, T> {
-    let sum: f32 = losses.iter().map(|(weight, loss)| weight * mean(loss)).sum();
+    let of_networks = |loss: &Tensor3| loss.shape().0 as f32 * mean(loss);
+    let sum: f32 = losses.iter().map(|(weight, loss)| weight * of_networks(loss)).sum();
     let y = super::device().tensor(sum);
     if T::OWNS_TAPE {
         let (y, losses) = (y.clone(), losses.to_vec());

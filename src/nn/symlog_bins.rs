@@ -33,9 +33,10 @@ impl SymlogBins {
     /// `count` bins (odd, at least 3) from `-limit` to `limit`, in symlog space; the middle one is zero.
     ///
     /// # Panics
-    /// If the count is even or below 3.
+    /// If the count is even or below 3, or `limit` is not positive or too large for an f32.
     pub fn new(count: usize, limit: f32) -> Self {
-        assert!(count >= 3 && count % 2 == 1, "an odd number of bins");
+        assert!(count >= 3 && count % 2 == 1, "`count` must be odd and at least 3");
+        assert!(limit > 0.0 && limit.exp_m1().is_finite(), "`limit` must be positive, and symexp of it finite");
         Self { count, limit }
     }
 

@@ -49,9 +49,13 @@ impl SymexpBins {
     /// `count` bins (odd, at least 3) from `-symexp(limit)` to `symexp(limit)`; the middle one is exactly zero.
     ///
     /// # Panics
-    /// If the count is even or below 3.
+    /// If the count is even or below 3, or `limit` is not positive or too large for an f32.
     pub fn new(count: usize, limit: f64) -> Self {
-        assert!(count >= 3 && count % 2 == 1, "an odd number of bins");
+        assert!(count >= 3 && count % 2 == 1, "`count` must be odd and at least 3");
+        assert!(
+            limit > 0.0 && (limit.exp_m1() as f32).is_finite(),
+            "`limit` must be positive, and symexp of it finite"
+        );
         let half = count / 2;
         let upper = |i: usize| (limit * i as f64 / half as f64).exp_m1() as f32;
         Self { bins: (0..count).map(|i| if i < half { -upper(half - i) } else { upper(i - half) }).collect() }

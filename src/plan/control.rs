@@ -157,11 +157,11 @@ impl RecedingHorizon {
             };
             let mut objective = WithCosts { objective, costs: self.config.costs(), before: &self.last };
             let plan = self.planner.plan(&mut Interpolated { objective: &mut objective, spline }, &mut observe, rng);
-            self.planner.shift(replan_every);
             let executed = plan.actions.get(..replan_every * self.action_size).unwrap_or_else(|| {
                 let numbers = plan.actions.len();
                 panic!("`replan_every` is {replan_every}, but the planner's plan has {numbers} numbers only")
             });
+            self.planner.shift(replan_every);
             self.queue.extend(spline.interpolate(executed));
         }
         self.last = self.queue.drain(..self.action_size).collect();

@@ -79,8 +79,9 @@ pub struct SequenceReplay {
 }
 
 impl SequenceReplay {
-    /// A buffer for `capacity` time steps.
+    /// A buffer for `capacity` time steps, at least one.
     pub fn new(observation_size: usize, action_size: usize, capacity: usize) -> Self {
+        let capacity = capacity.max(1);
         Self { observation_size, action_size, capacity, rows: Vec::new(), oldest: 0, arrival_reward: None }
     }
 
@@ -103,7 +104,10 @@ impl SequenceReplay {
     /// # Panics
     /// If observation or action have the wrong length.
     pub fn push(&mut self, t: &Transition) {
-        assert!(t.obs.len() == self.observation_size && t.action.len() == self.action_size, "sizes of this buffer");
+        assert!(
+            t.obs.len() == self.observation_size && t.action.len() == self.action_size,
+            "the sizes differ from those of the buffer"
+        );
         let first = self.arrival_reward.is_none();
         let reward = self.arrival_reward.unwrap_or(0.0);
         self.push_time_step(&t.obs, &t.action, reward, Flags { first, last: false, terminal: false });
@@ -119,7 +123,7 @@ impl SequenceReplay {
     /// # Panics
     /// If the observation has the wrong length.
     pub fn close(&mut self, obs: &[f32], terminal: bool) {
-        assert!(obs.len() == self.observation_size, "sizes of this buffer");
+        assert!(obs.len() == self.observation_size, "the sizes differ from those of the buffer");
         if let Some(reward) = self.arrival_reward.take() {
             self.push_time_step(
                 obs,
@@ -128,6 +132,11 @@ impl SequenceReplay {
                 Flags { first: false, last: true, terminal },
             );
         }
+    }
+
+    /// Gives up the current episode, whose last observation is not known: the next step begins another.
+    pub fn abandon(&mut self) {
+        self.arrival_reward = None;
     }
 
     fn push_time_step(&mut self, obs: &[f32], action: &[f32], reward: f32, flags: Flags) {
@@ -148,7 +157,7 @@ impl SequenceReplay {
     /// # Panics
     /// If the buffer holds fewer than `length` time steps.
     pub fn sample(&self, sequences: usize, length: usize, rng: &mut Rng) -> SequenceBatch {
-        assert!(self.len() >= length && length > 0, "enough to draw from");
+        assert!(self.len() >= length && length > 0, "the buffer holds fewer than `length` time steps");
         let starts: Vec<usize> = (0..sequences).map(|_| rng.random_range(0..=self.len() - length)).collect();
         self.at(&starts, length)
     }

@@ -125,7 +125,10 @@ impl ReplayBuffer {
     /// If observation or action have the wrong length.
     pub fn push(&mut self, t: &Transition) {
         let (obs, action) = (self.observation_size, self.action_size);
-        assert!(t.obs.len() == obs && t.next_obs.len() == obs && t.action.len() == action, "sizes of this buffer");
+        assert!(
+            t.obs.len() == obs && t.next_obs.len() == obs && t.action.len() == action,
+            "the sizes differ from those of the buffer"
+        );
         let tail = [f32::from(t.terminated)];
         let row = t.obs.iter().chain(&t.action).chain([&t.reward]).chain(&t.next_obs).chain(&tail);
         if self.len() < self.capacity {

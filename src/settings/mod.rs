@@ -46,7 +46,7 @@ pub(crate) trait Rule<T> {
     fn check(&self, path: &str, value: &T) -> Result<()>;
 }
 
-/// A field that is no number: the types allow all its values.
+/// A field that is not a number: every value of its type is valid.
 pub(crate) struct Any;
 
 /// Settings with ranges of their own.
@@ -80,7 +80,7 @@ impl Number for f64 {}
 
 impl<N: Number> Rule<N> for RangeInclusive<N> {
     fn check(&self, path: &str, value: &N) -> Result<()> {
-        // Not a number lies in no range.
+        // NaN lies in no range.
         if self.contains(value) {
             return Ok(());
         }
@@ -104,7 +104,7 @@ impl<N: Number> Rule<Vec<N>> for RangeInclusive<N> {
     }
 }
 
-/// For constructors that do not answer with an error.
+/// For constructors that do not return a `Result`.
 ///
 /// # Panics
 /// If a setting lies outside its range.

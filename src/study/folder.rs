@@ -10,7 +10,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::config::{RunConfig, bad_config};
-use super::evaluate::{Evaluation, Summary};
+use super::evaluate::Summary;
 use super::records::{Progress, TABLES, write_test};
 use super::tensorboard;
 use crate::agent::Method;
@@ -27,9 +27,12 @@ const LOCK: &str = ".lock";
 /// The note in a checkpoint, and in weights, that holds the run's configuration.
 const RUN: &str = "run";
 
+/// What stands between the versions that have worked on a run, where there is more than one.
+pub(super) const BETWEEN_VERSIONS: &str = ", ";
+
 /// The version of this program, with the commit of its sources if they are in a repository of their own: what `git describe` says
 /// of them when the first run begins.
-static SOURCE: LazyLock<String> = LazyLock::new(|| {
+pub(super) static SOURCE: LazyLock<String> = LazyLock::new(|| {
     let sources = env!("CARGO_MANIFEST_DIR");
     let git = |arguments: &[&str]| -> Option<String> {
         let said = Command::new("git").arg("-C").arg(sources).args(arguments).output().ok()?;
@@ -132,14 +135,16 @@ impl RunFolder {
     ///
     /// # Errors
     /// If a file cannot be written.
-    pub fn complete(&self, config: &RunConfig, test: &Evaluation) -> Result<()> {
+    pub fn complete(&self, config: &RunConfig, progress: &Progress) -> Result<()> {
+        let test = &progress.test;
         write_test(&self.path, test)?;
         let files = TABLES.into_iter().chain(config.learns().then_some(WEIGHTS));
         let checksums = files.map(|file| Ok((file.into(), checksum(&self.path.join(file))?)));
         let checksums = checksums.collect::<Result<_>>()?;
         // What is lost of a complete run may be written anew by a later version, which has not made it.
         let made_by = Completed::read(&self.path).ok().map(|run| run.version).filter(|version| !version.is_empty());
-        let version = made_by.unwrap_or_else(|| SOURCE.clone());
+        let all = || progress.versions.iter().map(String::as_str).collect::<Vec<_>>().join(BETWEEN_VERSIONS);
+        let version = made_by.unwrap_or_else(all);
         let completed = Completed { version, summary: test.summary(), checksums };
         let completed = toml::to_string(&completed).expect("a summary is TOML");
         files::write(&self.path.join(SUMMARY), completed.as_bytes())
@@ -149,7 +154,7 @@ impl RunFolder {
 /// What a run's `summary.toml` holds.
 #[derive(Serialize, Deserialize)]
 struct Completed {
-    /// The version of the program that completed it; earlier ones did not say.
+    /// The versions of the program that made it; earlier ones did not say.
     #[serde(default)]
     version: String,
     #[serde(flatten)]

@@ -3,10 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
+use super::folder::BETWEEN_VERSIONS;
 use super::names::excerpt;
 use super::starts::Starts;
 use super::tables::{Run, Tables};
 use crate::error::Result;
+use crate::watch::escaped;
 
 /// The fewest seeds, and episodes of a test, that a comparison should have.
 const SEEDS: usize = 5;
@@ -21,7 +23,8 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     let mut item = |claim: &str, exceptions: &[String]| {
         let answer = if exceptions.is_empty() { "yes" } else { "no" };
         write!(text, "- **{answer}**: {claim}").expect("text grows");
-        text += &if exceptions.is_empty() { ".\n".into() } else { format!(". Not: {}.\n", exceptions.join("; ")) };
+        text +=
+            &if exceptions.is_empty() { ".\n".into() } else { format!(". Exceptions: {}.\n", exceptions.join("; ")) };
     };
     let (mut few, mut short, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     let mut of_tasks: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
@@ -35,7 +38,7 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
         }
         let absent: Vec<String> = of_tasks[task].difference(seeds).map(u64::to_string).collect();
         if !absent.is_empty() {
-            missing.push(format!("`{method}` on `{task}` without {}", absent.join(", ")));
+            missing.push(format!("`{method}` on `{task}` lacks {}", absent.join(", ")));
         }
     }
     for (task, method) in tables.tasks_and_methods()? {
@@ -47,7 +50,7 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     }
     item("each learning method of a task has at least five seeds", &few);
     item("all learning methods of a task have the same seeds", &missing);
-    item("no run is left out", &left_out(tables)?);
+    item("every run is included", &left_out(tables)?);
     item(
         "all learning methods of a task are evaluated at the same steps with the same number of episodes",
         &different_grids.iter().map(|task| format!("on `{task}`")).collect::<Vec<_>>(),
@@ -76,14 +79,17 @@ fn left_out(tables: &Tables) -> Result<Vec<String>> {
 /// Why it cannot be said that one version, with its sources committed, made all runs; nothing if it can.
 fn versions(runs: &[Run]) -> Vec<String> {
     let versions: BTreeSet<&str> = runs.iter().map(|run| run.version.as_str()).collect();
-    let known = versions.iter().all(|version| version.contains('(') && !version.contains("dirty"));
+    // A run that several versions have worked on names them all.
+    let known = versions
+        .iter()
+        .all(|version| version.contains('(') && !version.contains("dirty") && !version.contains(BETWEEN_VERSIONS));
     if versions.len() == 1 && known {
         return Vec::new();
     }
     let shown = |version: &&str| if version.is_empty() { "one that is not recorded".into() } else { quoted(version) };
     let shown: Vec<String> = versions.iter().map(shown).collect();
     let none = versions.iter().all(|version| version.is_empty());
-    vec![if none { "it is not recorded".into() } else { format!("there are {}", shown.join(", ")) }]
+    vec![if none { "the version is not recorded".into() } else { format!("made by {}", shown.join(", ")) }]
 }
 
 /// The configurations, one for each method on a task, with the seeds and the versions of the program; folded, where a page can.
@@ -103,8 +109,7 @@ pub(super) fn configurations(tables: &Tables) -> Result<String> {
         let alike: Vec<&Run> =
             runs.iter().filter(|other| (&other.task, &other.method) == (&run.task, &run.method)).collect();
         let seeds: Vec<String> = alike.iter().map(|run| run.seed.to_string()).collect();
-        let versions: BTreeSet<String> =
-            alike.iter().map(|run| excerpt(&run.version).replace('&', "&amp;").replace('<', "&lt;")).collect();
+        let versions: BTreeSet<String> = alike.iter().map(|run| escaped(&excerpt(&run.version))).collect();
         let versions: Vec<String> = versions.into_iter().collect();
         let (of, version) = (if seeds.len() == 1 { "seed" } else { "seeds" }, versions.join(", "));
         write!(

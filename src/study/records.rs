@@ -1,6 +1,6 @@
 //! What a run records: the rows of its CSV files.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -124,6 +124,9 @@ impl ValueRow {
 pub(super) struct Progress {
     pub(super) step: usize,
     pub(super) seconds: f64,
+    /// The versions of the program that have worked on it.
+    #[serde(default)]
+    pub(super) versions: BTreeSet<String>,
     pub(super) episodes: Vec<EpisodeRow>,
     pub(super) evaluations: Vec<EvaluationRow>,
     pub(super) losses: Vec<LossRow>,

@@ -21,7 +21,7 @@ for (const button of document.querySelectorAll("button.replay")) {
       const [page, recording] = await Promise.all([unpacked("replay-page"), unpacked(button.value)]);
       frame.srcdoc = page
         .replaceAll("{{title}}", () => escaped(button.title))
-        .replace("{{recording}}", () => recording);
+        .replace("{{recording}}", () => recording.replaceAll("<", "\\u003c"));
     } catch (problem) {
       frame.srcdoc = `<p>This browser cannot unpack the replay (${escaped(problem.message)}).</p>`;
     }

@@ -16,6 +16,7 @@ use super::page::gzip;
 use super::records::write_csv;
 use super::registry::Registry;
 use super::tables::Tables;
+use super::verdict::listed;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::watch::Recording;
@@ -209,12 +210,14 @@ fn copy(replays: Vec<Replay>, from: &Path, to: &Path) -> Result<(Vec<Replay>, Ve
 pub(super) fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
     let mut studies = Vec::new();
     for folder in folders {
-        studies.push((folder, read(folder)?));
+        studies.push((folder, Tables::read(folder)?.tasks_and_methods()?, read(folder)?));
     }
-    let alike = |a: &Replay, b: &Replay| (&a.task, &a.method) == (&b.task, &b.method);
-    let with = |replay: &Replay| studies.iter().filter(|(_, of)| of.iter().any(|other| alike(other, replay))).count();
+    let with = |replay: &Replay| {
+        let method = (replay.task.clone(), replay.method.clone());
+        studies.iter().filter(|(_, methods, _)| methods.contains(&method)).count()
+    };
     let (mut rows, mut problems) = (Vec::new(), Vec::new());
-    for (folder, replays) in &studies {
+    for (folder, _, replays) in &studies {
         let own = replays.iter().filter(|replay| with(replay) == 1).cloned().collect();
         let (there, others) = copy(own, folder, to)?;
         rows.extend(there);
@@ -224,8 +227,8 @@ pub(super) fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
     Ok(problems)
 }
 
-/// The recorded episodes of a task, a row for each method.
-pub(super) fn table(replays: &[Replay], task: &str) -> String {
+/// The recorded episodes of a task, a row for each of these methods that has any.
+pub(super) fn table(replays: &[Replay], task: &str, methods: &[String]) -> String {
     let of_task: Vec<&Replay> = replays.iter().filter(|replay| replay.task == task).collect();
     let link = |replay: &Replay| {
         let outcome = if replay.success { "success" } else { "no success" };
@@ -246,9 +249,13 @@ pub(super) fn table(replays: &[Replay], task: &str) -> String {
     if rows.is_empty() {
         return rows;
     }
+    let without = methods.iter().filter(|method| of_task.iter().all(|replay| replay.method != **method));
+    let without: Vec<String> = without.map(|method| format!("`{method}`")).collect();
+    let without =
+        if without.is_empty() { String::new() } else { format!(" There is no replay of {}.", listed(&without)) };
     format!(
-        "\nTwo test episodes of each method's median seed (by success, then return), which play in 3D in `report.html`: the one with the \
-         median return and the one with the lowest. Lines from the hand are plans that the method compares.\n\n\
+        "\nTwo test episodes of the median seed (by success, then return) of each method below, which play in 3D in `report.html`: the one \
+         with the median return and the one with the lowest. Lines from the hand are plans that the method compares.{without}\n\n\
          | method | seed | median return | lowest return |\n| --- | --- | --- | --- |\n{rows}"
     )
 }

@@ -26,9 +26,9 @@ use std::time::{Duration, Instant};
 
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Evaluator};
-use super::folder::RunFolder;
 #[cfg(feature = "cli")]
 pub(crate) use super::folder::check_run;
+use super::folder::{RunFolder, SOURCE};
 pub use super::folder::{is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
@@ -101,7 +101,8 @@ impl<E: Env> Run<E> {
         // Whatever is wrong with the environment shows before anything is written.
         let (env, evaluator) = (Checked::new(make()?), Evaluator::new(make)?);
         let folder = RunFolder::claim(folder, &config)?;
-        let progress = folder.load(&config, &mut method)?.unwrap_or_default();
+        let mut progress = folder.load(&config, &mut method)?.unwrap_or_default();
+        progress.versions.insert(SOURCE.clone());
         let mut run = Self {
             env,
             evaluator,
@@ -227,12 +228,11 @@ impl<E: Env> Run<E> {
         let (test, episodes) = (&mut self.progress.test, self.config.test_episodes);
         let complete = self.evaluator.next_batch(test, &mut self.method, episodes, self.config.starts.test())?;
         self.save()?;
-        let test = &self.progress.test;
         if !complete {
-            return Ok(Event::Testing(test.results.len()));
+            return Ok(Event::Testing(self.progress.test.results.len()));
         }
-        self.folder.complete(&self.config, test)?;
-        Ok(Event::Tested(test.clone()))
+        self.folder.complete(&self.config, &self.progress)?;
+        Ok(Event::Tested(self.progress.test.clone()))
     }
 
     /// Writes the checkpoint, the weights and the CSV files. A run that is resumed starts its

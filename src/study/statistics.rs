@@ -20,6 +20,9 @@ use rand::RngExt;
 
 use crate::rng::Rng;
 
+/// The 97.5 % quantile of the standard normal distribution.
+const Z: f64 = 1.959_963_984_540_054;
+
 /// The 95 % Wilson score interval, `[low, high]`, of a success rate: `successes` out of `n` independent trials, like the
 /// episodes of one agent. Episodes of several seeds are not independent: see [`two_level_bootstrap`]. `[0, 1]` without trials.
 ///
@@ -32,7 +35,6 @@ pub fn wilson(successes: usize, n: usize) -> [f64; 2] {
     if n == 0 {
         return [0.0, 1.0];
     }
-    const Z: f64 = 1.959_963_984_540_054;
     let (n, p) = (n as f64, successes as f64 / n as f64);
     let centre = (p + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
     let half = Z / (1.0 + Z * Z / n) * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
@@ -141,7 +143,7 @@ pub fn two_level_bootstrap(tasks: &[&[Vec<f64>]], rng: &mut Rng) -> [f64; 2] {
     })
 }
 
-/// The 95 % t interval, `[low, high]`, of the mean over two to ten seeds; `None` for other numbers of them. With few seeds it
+/// The 95 % t interval, `[low, high]`, of the mean over two or more seeds; `None` for fewer. With few seeds it
 /// covers the truth more reliably than a bootstrap, but it may leave the range of possible values.
 ///
 /// Student, "The probable error of a mean", Biometrika 6 (1908).
@@ -153,7 +155,7 @@ pub fn t_interval(means: &[f64]) -> Option<[f64; 2]> {
 }
 
 /// The 95 % t interval, `[low, high]`, of the difference of two means over independent seeds, first minus second; `None` if
-/// one has fewer than two or more than ten seeds. Like [`t_interval`], safer than a bootstrap with few seeds.
+/// one has fewer than two seeds. Like [`t_interval`], safer than a bootstrap with few seeds.
 ///
 /// Welch, "The generalization of 'Student's' problem", Biometrika 34 (1947). Deviation: the degrees of freedom are the smaller
 /// of the two numbers of seeds, less one, which makes the interval wider.
@@ -178,11 +180,18 @@ pub fn ratio_t_interval(first: &[f64], second: &[f64]) -> Option<[f64; 2]> {
     Some([ratio / factor, ratio * factor])
 }
 
-/// The 97.5 % quantile of Student's t distribution for the mean of two to ten values.
+/// The 97.5 % quantile of Student's t distribution for the mean of two or more values.
 fn t_quantile(values: usize) -> Option<f64> {
     /// For 1 to 9 degrees of freedom.
     const QUANTILES: [f64; 9] = [12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622];
-    QUANTILES.get(values.checked_sub(2)?).copied()
+    let freedom = values.checked_sub(1).filter(|freedom| *freedom > 0)?;
+    // From ten on, the first terms of its expansion in their reciprocal (Abramowitz & Stegun 1964, 26.7.5) are exact to 1e-4.
+    let (n, z) = (freedom as f64, Z);
+    let expansion = z
+        + (z.powi(3) + z) / (4.0 * n)
+        + (5.0 * z.powi(5) + 16.0 * z.powi(3) + 3.0 * z) / (96.0 * n.powi(2))
+        + (3.0 * z.powi(7) + 19.0 * z.powi(5) + 17.0 * z.powi(3) - 15.0 * z) / (384.0 * n.powi(3));
+    Some(QUANTILES.get(freedom - 1).copied().unwrap_or(expansion))
 }
 
 /// The square of the standard error of a mean.
@@ -230,12 +239,51 @@ pub fn paired_difference(first: &[Vec<f64>], second: &[Vec<f64>], rng: &mut Rng)
 #[doc(alias = "Mann-Whitney")]
 #[doc(alias = "common language effect size")]
 pub fn probability_of_improvement(first: &[f64], second: &[f64], rng: &mut Rng) -> (f64, [f64; 2]) {
-    let share = |first: &[f64], second: &[f64]| {
-        let won = |a: &f64| second.iter().map(|b| if a > b { 1.0 } else { f64::from(a == b) / 2.0 }).sum::<f64>();
+    probability_of_winning(first, second, |a, b| a > b, rng)
+}
+
+/// When a run reached a level: its environment steps, or those of its budget if it did not.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Time {
+    /// By this step.
+    Reached(f64),
+    /// Right-censored: not within so many steps.
+    Censored(f64),
+}
+
+/// The probability that a run of the first method reaches the level by an earlier step than one of the second, over all pairs of
+/// runs, and its 95 % bootstrap interval. Ties, and pairs whose order censoring hides, count half: a run that did not reach the level
+/// within its budget is later than one that did within the same budget, but may be earlier than one that did after it.
+///
+/// Gehan, "A generalized Wilcoxon test for comparing arbitrarily singly-censored samples", Biometrika 52 (1965).
+///
+/// # Panics
+/// If one has no runs.
+#[doc(alias = "Gehan")]
+#[doc(alias = "sample efficiency")]
+pub fn probability_of_being_earlier(first: &[Time], second: &[Time], rng: &mut Rng) -> (f64, [f64; 2]) {
+    let is_earlier = |a: &Time, b: &Time| match (a, b) {
+        (Time::Reached(a), Time::Reached(b)) => a < b,
+        (Time::Reached(a), Time::Censored(budget)) => a <= budget,
+        (Time::Censored(_), _) => false,
+    };
+    probability_of_winning(first, second, is_earlier, rng)
+}
+
+/// The share of pairs that the first wins, a draw counting half, and its bootstrap interval over both.
+fn probability_of_winning<T: Copy>(
+    first: &[T],
+    second: &[T],
+    wins: impl Fn(&T, &T) -> bool,
+    rng: &mut Rng,
+) -> (f64, [f64; 2]) {
+    let share = |first: &[T], second: &[T]| {
+        let score = |a: &T, b: &T| (1.0 + f64::from(wins(a, b)) - f64::from(wins(b, a))) / 2.0;
+        let won = |a: &T| second.iter().map(|b| score(a, b)).sum::<f64>();
         first.iter().map(won).sum::<f64>() / (first.len() * second.len()) as f64
     };
     let interval = percentiles(|| {
-        let drawn = |values: &[f64], rng: &mut Rng| resample(values, rng).copied().collect::<Vec<f64>>();
+        let drawn = |values: &[T], rng: &mut Rng| resample(values, rng).copied().collect::<Vec<T>>();
         share(&drawn(first, rng), &drawn(second, rng))
     });
     (share(first, second), interval)
@@ -277,8 +325,8 @@ pub fn area_under_curve(steps: &[f64], success: &[f64], budget: f64) -> f64 {
     area / (budget - first)
 }
 
-/// The environment steps of the first evaluation from which a success rate of `level` is held: there and at the next
-/// evaluation, or at the last evaluation. `None` if there is none: the run is right-censored at its budget.
+/// The environment steps of the first evaluation at which the success rate is at least `level`, there and at the next evaluation.
+/// `None` if there is none: the run is right-censored at its budget. So is one that reaches the level at its last evaluation only.
 ///
 /// What lies between two evaluations is not known, so this is the step *by* which the level is reached. Two evaluations have
 /// to agree because each has few episodes: with 20, a policy whose true success rate is 70 % scores at least 80 % with probability
@@ -286,8 +334,8 @@ pub fn area_under_curve(steps: &[f64], success: &[f64], budget: f64) -> f64 {
 #[doc(alias = "sample efficiency")]
 #[doc(alias = "steps to threshold")]
 pub fn steps_to(level: f64, steps: &[f64], success: &[f64]) -> Option<f64> {
-    let holds = |i: &usize| success[*i] >= level && success.get(i + 1).is_none_or(|next| *next >= level);
-    (0..success.len()).find(holds).map(|i| steps[i])
+    let reached = success.windows(2).position(|pair| pair.iter().all(|rate| *rate >= level));
+    reached.map(|i| steps[i])
 }
 
 /// The median of times of which some are right-censored (`None`), all at the same budget, as Kaplan & Meier (JASA 53, 1958)

@@ -3,11 +3,11 @@
 use polars::prelude::*;
 
 use super::statistics::{
-    IQM_RUNS, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
-    probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean, steps_to, t_interval,
-    two_level_bootstrap, welch_interval, wilson,
+    IQM_RUNS, Time, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
+    probability_of_being_earlier, probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean,
+    steps_to, t_interval, two_level_bootstrap, welch_interval, wilson,
 };
-use super::tables::{BASELINE, Curve, LEVEL, by_run, curves, lists, of, optional_curves, strings};
+use super::tables::{BASELINE, Curve, LEVEL, by_run, lists, numbers, of, optional_curves, strings};
 use crate::rng::{self, Rng};
 
 /// The runs of one method on one task.
@@ -24,8 +24,9 @@ struct Runs {
     action_ms: Vec<Curve>,
     /// For each seed, the gradient steps until each evaluation; the same.
     updates: Vec<Curve>,
-    /// For each seed, the expected returns in each evaluation, those that followed, and the correlation of the two.
-    expectations: [Vec<Curve>; 3],
+    /// For each seed, the expected return in its last evaluation, the one that followed, and the correlation of the two: NaN where one is
+    /// not a number.
+    expectations: [Vec<f64>; 3],
     /// Columns of the test whose mean is taken over all episodes.
     means: Vec<(&'static str, Option<f64>)>,
 }
@@ -58,7 +59,13 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
         let over_steps = |column: &str| optional_curves(evaluations, &task, &method, column);
         let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
         let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
-        let of_values = |column: &str| self::curves(values, &task, &method, column);
+        let at_the_end = last_rows(&of(values, &task, &method)?)?;
+        let of_values = |column: &str| -> PolarsResult<Vec<f64>> {
+            if at_the_end.width() == 0 {
+                return Ok(Vec::new());
+            }
+            Ok(numbers(&at_the_end, column)?.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())
+        };
         let expectations = [of_values("expected")?, of_values("realised")?, of_values("correlation")?];
         all.push(Runs { task, method, success, curves, clocks, action_ms, updates, expectations, means });
     }
@@ -145,6 +152,13 @@ impl Runs {
         self.curves.iter().map(|(x, y)| steps_to(LEVEL, x, y)).collect()
     }
 
+    /// The same, with the budget of each seed that does not reach it.
+    fn censored_times(&self) -> Vec<Time> {
+        let budgets = self.curves.iter().map(|(x, _)| x.last().copied().unwrap_or(0.0));
+        let of_seed = |(time, budget): (Option<f64>, f64)| time.map_or(Time::Censored(budget), Time::Reached);
+        self.times().into_iter().zip(budgets).map(of_seed).collect()
+    }
+
     /// After how many seconds of training each seed reaches the level.
     fn seconds(&self) -> Vec<Option<f64>> {
         let at = |(steps, seconds): &Curve, time: f64| Some(seconds[steps.iter().position(|step| *step == time)?]);
@@ -189,8 +203,8 @@ impl Runs {
             let action_ms: Vec<Option<f64>> = last_of_each(&self.action_ms).into_iter().map(Some).collect();
             row.push(("action_ms", censored_median(&action_ms)));
             row.push(("updates", Some(mean(&last_of_each(&self.updates)))));
-            let [expected, realised, correlation] =
-                self.expectations.each_ref().map(|curves| mean(&last_of_each(curves)));
+            // If the values of one seed have diverged, so has their mean.
+            let [expected, realised, correlation] = self.expectations.each_ref().map(|seeds| mean(seeds));
             row.push(("optimism", Some((expected - realised) / realised.abs())));
             row.push(("return_correlation", Some(correlation)));
             let areas: Vec<f64> = self.curves.iter().map(|(x, y)| area_under_curve(x, y, common)).collect();
@@ -230,22 +244,22 @@ impl Runs {
             let [low, high] = [low, high].map(|end| Some(end.clamp(-1.0, 1.0)));
             row.extend([("success_minus_sac_t_low", low), ("success_minus_sac_t_high", high)]);
         }
-        // A censored run is later than any other.
-        let sooner = |runs: &Self| runs.times().iter().map(|time| -time.unwrap_or(f64::INFINITY)).collect::<Vec<f64>>();
-        for (entries, first, second) in [
+        for (entries, (probability, [low, high])) in [
             (
                 ["improvement_over_sac", "improvement_over_sac_low", "improvement_over_sac_high"],
-                self.by_seed(),
-                baseline.by_seed(),
+                probability_of_improvement(&self.by_seed(), &baseline.by_seed(), &mut stream()),
             ),
-            (["earlier_than_sac", "earlier_than_sac_low", "earlier_than_sac_high"], sooner(self), sooner(baseline)),
+            (
+                ["earlier_than_sac", "earlier_than_sac_low", "earlier_than_sac_high"],
+                probability_of_being_earlier(&self.censored_times(), &baseline.censored_times(), &mut stream()),
+            ),
         ] {
-            let (probability, [low, high]) = probability_of_improvement(&first, &second, &mut stream());
             row.extend(entries.into_iter().zip([probability, low, high].map(Some)));
         }
         // With a censored seed of this method, the ratio would be neither an estimate nor a bound; with one of the baseline's,
-        // which counts as its budget, it is a lower bound, and its interval has no upper end.
-        if let Some(times) = self.times().into_iter().collect::<Option<Vec<f64>>>() {
+        // which counts as its budget, it is a lower bound, and its interval has no upper end. There is no ratio to no steps at all.
+        let times = self.times().into_iter().collect::<Option<Vec<f64>>>();
+        if let Some(times) = times.filter(|times| times.iter().all(|time| *time > 0.0)) {
             let budget = baseline.budget().unwrap_or(f64::NAN);
             let known = baseline.times().iter().all(Option::is_some);
             let longer: Vec<f64> = baseline.times().into_iter().map(|time| time.unwrap_or(budget)).collect();
@@ -260,6 +274,16 @@ impl Runs {
         }
         row
     }
+}
+
+/// The last values of each run.
+fn last_rows(rows: &DataFrame) -> PolarsResult<DataFrame> {
+    if rows.width() == 0 {
+        return Ok(rows.clone());
+    }
+    let by_step = rows.clone().lazy().sort(["step"], SortMultipleOptions::default());
+    let values = ["expected", "realised", "correlation"].map(|name| col(name).last());
+    by_step.group_by(["task", "method", "seed"].map(col)).agg(values).collect()
 }
 
 /// The last value of each curve.

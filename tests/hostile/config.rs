@@ -76,7 +76,8 @@ pub(super) const SMALL: [(&str, &str); 6] = [
          [dreamer.behaviour]
          units = 8
          layers = 1
-         horizon = 3",
+         horizon = 3
+         target_entropy = 0.5",
     ),
     (
         "small-tdmpc2",

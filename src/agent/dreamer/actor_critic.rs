@@ -16,6 +16,7 @@ use crate::nn::{
 };
 use crate::replay::SequenceBatch;
 use crate::rng::{self, Rng};
+use crate::settings::must_hold;
 
 /// The actor (a policy over the features of latent states) and the critic (a two-hot distribution of returns).
 #[derive(Clone, Debug)]
@@ -78,7 +79,11 @@ impl ActorCriticLoss {
 impl ActorCritic {
     /// New networks for the features of a world model, and the target network. At first the policy is nearly the same in
     /// all states, and every value is zero.
+    ///
+    /// # Panics
+    /// If a setting lies outside its range.
     pub fn new(world: &WorldModel, actions: usize, config: &ActorCriticConfig, rng: &mut Rng) -> (Self, TargetCritic) {
+        must_hold(config, "behaviour");
         let hidden = vec![config.units; config.layers];
         let features = world.config().rssm.features();
         let policy = Mlp::dreamer(world.device(), features, &hidden, Some(2 * actions), rng).scale_output(0.01);

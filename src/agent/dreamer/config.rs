@@ -46,10 +46,10 @@ pub struct DreamerConfig {
     pub warm_up: usize,
     /// Whether the steps of the warm-up owe updates by the replay ratio, too; all of them are made at its end.
     pub warm_up_updates: bool,
-    /// Exponent beta of the coloured noise that random actions are made of: 0 is white.
+    /// Exponent beta of the spectrum of the random actions, which are normal deviates clamped to [-1, 1]: 0 is white noise.
     pub warm_up_noise_beta: f64,
     /// Exponent beta of the coloured noise by which actions are drawn from the policy while it explores: 0 is white, as in
-    /// the published code. Temporally correlated noise moves a hand farther (Eberhard et al. 2023).
+    /// the published code. Temporally correlated noise moves a hand farther (Eberhard et al. 2023). Without effect with a planner.
     pub exploration_noise_beta: f64,
     /// Capacity of the replay buffer, in decisions.
     pub replay: usize,
@@ -117,7 +117,7 @@ require fits(&[*batch, dreams.unwrap_or(*length), behaviour.horizon, world.wides
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ActorGradient {
-    /// Actions become likelier by their advantages, as in the published code.
+    /// Log-probabilities of actions are weighted by their advantages, as in the published code.
     #[default]
     Reinforce,
     /// Returns are differentiated with respect to actions, through the learned dynamics, as in DreamerV1 and V2.

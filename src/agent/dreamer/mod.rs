@@ -7,9 +7,11 @@
 //! version. Deviations: there is one environment, the first actions are random (`warm_up`), the replay buffer is smaller, its
 //! sequences start with a latent state of zeros, new experience has no precedence in it, positions are seen as differences
 //! (`model/features/latent.rs`), and in evaluation the policy acts by its mean. Optional: rollouts from a part of the states
-//! (`dreams`), exploration with coloured noise, an entropy coefficient tuned towards a target entropy, a group lasso on the
-//! encoder's inputs, with a probe that reconstructs what it prunes. PlaNet has Gaussian states and the KL divergence in its loss
-//! once.
+//! (`dreams`), decisions of several time steps, updates owed for the warm-up, exploration with coloured noise, an actor gradient through
+//! the dynamics, centred advantages, a penalty on the mean action, an entropy coefficient tuned towards a target entropy, a group lasso
+//! on the encoder's inputs, with a probe that reconstructs what it prunes. PlaNet has Gaussian states, the KL divergence in its loss
+//! once, no critic at the end of a plan, and Gaussian noise on planned actions while it collects experience; here plans are executed
+//! without noise.
 //!
 //! ```
 //! use handful::agent::dreamer::DreamerConfig;
@@ -148,6 +150,7 @@ impl Dreamer {
 
 impl Agent for Dreamer {
     fn begin_episode(&mut self) {
+        self.replay.abandon();
         self.forget_episode();
         self.slots.clear(0);
     }
@@ -175,7 +178,12 @@ impl Agent for Dreamer {
     }
 
     fn act_and_explain(&mut self, slot: &Slot) -> (Vec<f32>, Vec<ImaginedTrajectory>) {
+        let decided = slot.first || self.slots.existing(slot.index).is_none_or(|state| state.held.is_due());
         let action = self.act_batch(&[*slot]).remove(0);
+        // An action that is held, or that is planned, was not chosen by the actor now.
+        if !decided || self.config.planner.is_some() {
+            return (action, Vec::new());
+        }
         let Networks { world, behaviour, .. } = &self.networks;
         let fresh = |i| PolicyState::of_slot(world, &self.config, self.spec.action_size, i);
         let start = self.slots.state(slot.index, fresh).latent.repeated(0, SHOWN);
@@ -203,7 +211,7 @@ impl Agent for Dreamer {
     }
 
     fn update(&mut self) -> Option<Losses> {
-        if self.observed < self.config.warm_up {
+        if self.observed < self.config.warm_up || self.replay.len() < self.config.length {
             return None;
         }
         let DreamerConfig { batch, length, train_ratio, warm_up, warm_up_updates, .. } = self.config;
@@ -299,8 +307,7 @@ impl Checkpoint for Dreamer {
         self.update_credit = update_credit;
         self.rng = own;
         self.policy_state = PolicyState::new(&self.networks.world, &self.config, self.spec.action_size, policy_state);
-        self.random.reset();
-        self.noise.reset();
+        self.forget_episode();
         Ok(())
     }
 }

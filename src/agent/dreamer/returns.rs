@@ -28,6 +28,9 @@ use crate::replay::SequenceBatch;
 /// assert_eq!(returns(0.0), 1.0 + 0.5 * 10.0);
 /// assert_eq!(returns(1.0), 1.0 + 0.5 * (2.0 + 0.5 * 20.0));
 /// ```
+///
+/// # Panics
+/// If there are no time steps, or the lists differ in length.
 #[doc(alias = "TD(lambda)")]
 #[doc(alias = "lambda-return")]
 #[doc(alias = "Bellman")]
@@ -93,6 +96,9 @@ impl ReturnScale {
     }
 
     /// Moves the percentiles towards those of the returns of a batch, which are sorted in place.
+    ///
+    /// # Panics
+    /// If there are none.
     pub fn update(&mut self, returns: &mut [f32]) {
         returns.sort_by(f32::total_cmp);
         self.low += Self::RATE * (percentile(returns, 0.05) - self.low);

@@ -28,7 +28,7 @@ pub struct PetsConfig {
     /// Without, an agent moves smoothly in evaluations, and still tries what costs more.
     pub explore_with_costs: bool,
     /// Weight of the terminal reward: this many times the reward of resting in a plan's last state is added to the plan's
-    /// return, so that a short plan prefers to end well.
+    /// return, so that a short plan prefers to end well. The gradient steps of `gradient` and `hybrid` planners ascend the rewards alone.
     pub terminal_weight: f32,
     /// How uncertainty is propagated along imagined trajectories.
     #[doc(alias = "trajectory sampling")]

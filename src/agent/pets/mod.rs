@@ -161,7 +161,7 @@ impl Pets {
 
     /// Fits the model to the replay buffer, and plans in it from the next action on. Returns `model_loss` (the mean negative
     /// log-likelihood of normalised targets), `model_steps` (gradient steps) and `model_error` (the mean squared error on
-    /// held-out transitions, in normalised units).
+    /// held-out transitions, in normalised units) and, with a learned reward, `reward_error` (the same of its networks).
     ///
     /// # Panics
     /// If fewer than two decisions have been observed.

@@ -81,7 +81,7 @@ impl Sac {
         values(&SquashedGaussian::from_head(head).sample(noise).0).to_vec()
     }
 
-    fn forget_episode(&mut self) {
+    pub(super) fn forget_episode(&mut self) {
         self.held.reset();
         self.decision.reset();
         [&mut self.warm_up_noise, &mut self.exploration_noise].into_iter().flatten().for_each(RandomActions::reset);

@@ -72,6 +72,7 @@ impl Checkpoint for Sac {
         self.observed = counts[0] as usize;
         self.updates = counts[1] as usize;
         self.rng = rng;
+        self.forget_episode();
         Ok(())
     }
 }

@@ -69,7 +69,8 @@ pub struct SacConfig {
     pub n_step: usize,
     /// Share of a minibatch whose goals are replaced by what the same episode achieved later: hindsight experience replay
     /// (Andrychowicz et al. 2017, who take 0.8). The environment needs a goal, and the agent the reward as a function of
-    /// observations: [`Sac::with_reward`](super::Sac::with_reward).
+    /// observations: [`Sac::with_reward`](super::Sac::with_reward). All rewards of the minibatch are then those of that function, as if
+    /// a decision were one time step.
     #[doc(alias = "HER")]
     pub hindsight: f32,
     /// Critic updates for each time step: the update-to-data ratio.

@@ -27,7 +27,7 @@ pub(super) struct Hindsight {
 
 impl Hindsight {
     pub(super) fn new(spec: &Spec, reward: Option<SharedReward>, share: f32) -> Result<Self> {
-        let refused = |what: &str| Error::Config(format!("`sac.hindsight` is {share}, but {} {what}", spec.name));
+        let refused = |what: &str| Error::Unsupported(format!("`sac.hindsight` is {share}, but {} {what}", spec.name));
         let reward = reward.filter(|reward| reward.is_known());
         let reward = reward.ok_or_else(|| refused("has no reward that is known as a function of observations"))?;
         let constant = |i: usize| spec.observation[i].role == Role::Constant;

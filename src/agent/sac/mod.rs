@@ -112,7 +112,8 @@ impl Sac {
     /// reward; without, it makes no use of it.
     ///
     /// # Errors
-    /// As [`Sac::new`], or if the settings ask for hindsight where there is no goal or the reward is not known.
+    /// As [`Sac::new`]; [`Error::Unsupported`](crate::error::Error::Unsupported) if the settings ask for hindsight where there is no goal
+    /// or the reward is not known.
     pub fn with_reward(spec: &Spec, reward: Option<SharedReward>, config: SacConfig, seed: u64) -> Result<Self> {
         config.check_at("sac")?;
         spec.check()?;
@@ -188,6 +189,9 @@ impl Sac {
     /// One update on a random minibatch: of the critics and their target network, and, when it is due, of policy and
     /// temperature. Returns `critic_loss`, `q` (the critics' mean value), and of the policy `policy_loss`, `entropy` (of the
     /// actions, in nats) and `temperature`; `critic_gradient` and `policy_gradient` are norms before clipping.
+    ///
+    /// # Panics
+    /// If nothing has been observed.
     #[doc(alias = "Bellman")]
     pub fn learn(&mut self) -> Losses {
         let SacConfig { batch, n_step, .. } = self.config;

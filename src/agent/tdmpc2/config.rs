@@ -26,7 +26,8 @@ pub struct TdMpc2Config {
     pub updates_per_step: f32,
     /// Time steps of random actions before the first update.
     pub warm_up: usize,
-    /// Exponent of the spectrum of the random actions: 0 is white noise, 1 pink noise.
+    /// Exponent of the spectrum of the random actions, which are normal deviates clamped to [-1, 1]: 0 is white noise, 1 pink noise. The
+    /// published code draws uniform ones.
     pub warm_up_noise_beta: f64,
     /// Exponent of the spectrum of the noise around a plan while it explores; white if absent.
     #[doc(alias = "pink noise")]
@@ -73,7 +74,7 @@ pub struct TdMpc2Config {
     pub target_rate: f32,
     /// Weight of the entropy bonus in the policy's loss.
     pub entropy: f32,
-    /// Whose entropy that is.
+    /// Which entropy: that of the Gaussian before the tanh, or of the squashed action.
     pub entropy_bonus: EntropyBonus,
     /// The world model.
     pub model: ImplicitConfig,

@@ -190,6 +190,7 @@ impl TdMpc2 {
 
 impl Agent for TdMpc2 {
     fn begin_episode(&mut self) {
+        self.replay.abandon();
         self.forget_episode();
         self.slots.clear(0);
     }

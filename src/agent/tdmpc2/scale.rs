@@ -28,6 +28,9 @@ impl RunningScale {
     }
 
     /// Takes in a batch of values.
+    ///
+    /// # Panics
+    /// If there are none.
     pub fn update(&mut self, values: &[f32]) {
         let mut sorted = values.to_vec();
         sorted.sort_by(f32::total_cmp);

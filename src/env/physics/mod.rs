@@ -34,7 +34,7 @@ use super::kinematics::{KinematicModel, Kinematics};
 
 /// Control steps per second: how often an agent acts.
 pub const CONTROL_HZ: f64 = 20.0;
-/// Physics steps in one control step; the controller computes new torques in each.
+/// Physics steps in one control step (robosuite: 25 of 2 ms); the controller computes new torques in each.
 pub const STEPS_PER_CONTROL: usize = 8;
 /// Seconds of one physics step.
 pub const TIMESTEP: f64 = 1.0 / (CONTROL_HZ * STEPS_PER_CONTROL as f64);

@@ -80,7 +80,7 @@ use super::osc::{Goal, OperationalSpaceController};
 use super::physics::{JointState, Physics, STEPS_PER_CONTROL, TIMESTEP};
 use super::scene::{Body, Camera};
 use super::{Env, KnownReward, Snapshot, Spec, Step};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::rng;
 
 /// How far ahead of the hand a full action puts its goal, m.
@@ -261,6 +261,9 @@ impl Env for Tabletop {
 
     fn step(&mut self, action: &[f32]) -> Result<Step> {
         self.spec.check_action(action)?;
+        if self.state.compact.is_empty() {
+            return Err(Error::action(&self.spec.name, "a step before the first reset; reset first"));
+        }
         self.command(action);
         self.advance();
         self.state.elapsed += 1;

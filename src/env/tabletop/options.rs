@@ -60,8 +60,8 @@ pub enum ObservationKind {
 pub struct TableOptions {
     /// The reward that the environment pays.
     pub reward: RewardKind,
-    /// The reward that planners maximise which are given one (the oracle, and PETS unless it learns the reward); the same if
-    /// absent. Results are measured with `reward` all the same.
+    /// The reward that is known to methods which are told one (the oracle, PETS unless it learns the reward, SAC with hindsight); the
+    /// same if absent. Results are measured with `reward` all the same.
     pub planning_reward: Option<RewardKind>,
     /// The meaning of an action.
     pub action: ActionKind,

@@ -96,7 +96,7 @@ pub trait TableTask: Send + Sync {
     /// The bodies to draw: one for each object, in the order of [`Setup::objects`], then one for the goal if there is one.
     fn drawn(&self, setup: &Setup) -> Vec<Body>;
 
-    /// Where the 3D replay is seen from: by default from the front, with the table's middle in the middle.
+    /// Where the 3D replay is seen from: by default obliquely from the front, aimed between the arm's base and the middle of the table.
     fn camera(&self) -> Camera {
         Camera { eye: [0.85, -0.95, 1.4], target: [-0.17, 0.0, 0.99] }
     }

@@ -153,7 +153,8 @@ pub struct ImaginedReturns {
     pub returns: Vec<f32>,
     /// Disagreement of the members (epistemic uncertainty) along each candidate, `[candidates]`, summed over time steps: the
     /// standard deviation between members in units of the typical change per time step, root mean square over the
-    /// predicted features.
+    /// predicted features. With [`Propagation::TsInf`] and [`Propagation::Ts1`] it compares means of sampled particles, so that their
+    /// aleatoric noise adds to it.
     #[doc(alias = "epistemic uncertainty")]
     pub disagreement: Vec<f32>,
 }
@@ -174,14 +175,13 @@ impl Imagination<'_> {
     /// threads.
     ///
     /// # Panics
-    /// If the sizes do not fit together, the particles are not a multiple of the members, or the reward is
+    /// If there is no horizon or no particle, the sizes do not fit together, the particles are not a multiple of the members, or the reward is
     /// [`Reward::Learned`] and the model has not learned rewards.
     #[doc(alias = "CRN")]
     #[doc(alias = "common random numbers")]
     pub fn imagined_returns(&self, obs: &[f32], actions: &[f32], horizon: usize, rng: &mut Rng) -> ImaginedReturns {
+        let (count, particles) = (self.candidates(actions, horizon), self.particles());
         let width = horizon * self.dynamics.action_size();
-        let (count, particles) = (actions.len() / width, self.particles());
-        assert_eq!(count * width, actions.len(), "whole sequences");
         let noise = CommonRandomNumbers::draw(self, horizon, rng);
         let mut returns = vec![0.0; count * particles];
         let mut disagreement = vec![0.0; count];
@@ -207,8 +207,7 @@ impl Imagination<'_> {
         horizon: usize,
         rng: &mut Rng,
     ) -> (Vec<Vec<f32>>, ImaginedReturns) {
-        let count = actions.len() / (horizon * self.dynamics.action_size());
-        let particles = self.particles();
+        let (count, particles) = (self.candidates(actions, horizon), self.particles());
         let noise = CommonRandomNumbers::draw(self, horizon, rng);
         let (mut returns, mut disagreement) = (vec![0.0; count * particles], vec![0.0; count]);
         let mut trajectories = Vec::with_capacity(horizon + 1);
@@ -216,6 +215,14 @@ impl Imagination<'_> {
         Rollout::new(self, &obs, actions, &mut returns, &mut disagreement)
             .run(horizon, &noise, |states| trajectories.push(states.to_vec()));
         (trajectories, ImaginedReturns { particles, returns, disagreement })
+    }
+
+    /// How many candidates `actions` holds.
+    fn candidates(&self, actions: &[f32], horizon: usize) -> usize {
+        let width = horizon * self.dynamics.action_size();
+        assert!(width > 0 && self.particles() > 0, "`horizon` and `particles` must be at least 1");
+        assert!(actions.len().is_multiple_of(width), "`actions` must hold whole sequences of `horizon` actions");
+        actions.len() / width
     }
 
     /// Candidates in one parallel task.
@@ -226,7 +233,7 @@ impl Imagination<'_> {
             }
             Propagation::Expectation | Propagation::MomentMatching => count * self.particles(),
         };
-        let parts = rows.div_ceil(ROWS).next_multiple_of(rayon::current_num_threads());
+        let parts = rows.div_ceil(ROWS).max(1).next_multiple_of(rayon::current_num_threads());
         count.div_ceil(parts).max(1)
     }
 

@@ -25,9 +25,10 @@ pub struct ImplicitConfig {
     /// Bins of the two-hot distributions of rewards and values, an odd number.
     pub bins: usize,
     /// The outermost bins, in symlog space. They have to hold every value, up to reward / (1 - discount): 5 reaches to 147, 10 to
-    /// 22,025. Beyond them all values are the same, and nothing leads out of there.
+    /// 22,025. Targets beyond them are clipped, so that larger values cannot be told apart.
     pub bin_limit: f32,
-    /// Whether to learn when the task itself ends. Without it a plan never ends; with a time limit alone that is right.
+    /// Whether to learn when the task itself ends. Without it, imagined rollouts never terminate, which is right if only the time limit
+    /// ends episodes.
     pub terminates: bool,
     /// The weight of each step of a rollout relative to the step before it (rho).
     #[doc(alias = "rho")]

@@ -35,8 +35,8 @@ impl ImplicitLoss {
         all
     }
 
-    /// How far the last latent state of the rollouts is from the encoded one, as a fraction of how far the latter has moved
-    /// from the start: 0 is perfect, 1 is as good as predicting no change. Unlike the loss it does not fall when latent states
+    /// Squared distance of the rollouts' last latent states from the encoded ones, as a fraction of the squared distance that the latter
+    /// have moved from the start: 0 is perfect, 1 is as good as predicting no change. Unlike the loss it does not fall when latent states
     /// collapse.
     pub fn drift(&self, encoded: &Tensor3) -> f32 {
         let (Some(first), Some(last)) = (self.latents.first(), self.latents.last()) else { return 0.0 };

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::math::{mish, mish_slope, silu, silu_slope};
+use super::math::{mish, mish_slope, relu, silu, silu_slope};
 use super::vectorised_fn;
 
 /// The activation after a layer's affine part.
@@ -25,7 +25,7 @@ vectorised_fn! {
     pub fn add_and_activate(y: &'a mut [f32], b: &'a [f32], activation: Activation) {
         match activation {
             Activation::Identity => for_rows(y, b, |x| x),
-            Activation::Relu => for_rows(y, b, |x| x.max(0.0)),
+            Activation::Relu => for_rows(y, b, relu),
             Activation::Silu => for_rows(y, b, silu),
             Activation::Mish => for_rows(y, b, mish),
         }
@@ -52,7 +52,7 @@ vectorised_fn! {
 pub(crate) fn activate(y: &mut [f32], activation: Activation) {
     match activation {
         Activation::Identity => {}
-        Activation::Relu => y.iter_mut().for_each(|y| *y = y.max(0.0)),
+        Activation::Relu => y.iter_mut().for_each(|y| *y = relu(*y)),
         Activation::Silu => y.iter_mut().for_each(|y| *y = silu(*y)),
         Activation::Mish => y.iter_mut().for_each(|y| *y = mish(*y)),
     }

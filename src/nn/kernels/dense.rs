@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::activation::{activate_all, add_and_activate};
+use super::matrix::SMALL_PRODUCT;
 use super::{Activation, Matrix, matmul, vectorised};
 
 /// The sizes of a dense layer over several networks at once.
@@ -98,7 +99,10 @@ pub fn dense_input_gradient(dx: &mut [f32], dz: &[f32], w: &[f32], shape: DenseS
     let dz_of = |member: usize| {
         Matrix::new(&dz[member * shape.batch * shape.output..][..shape.batch * shape.output], shape.output)
     };
-    let rows = shape.rows_per_task(shape.batch);
+    // No task may be so small that its sums are in another order, unless the whole product is: bits would depend on the threads.
+    let small = |rows: usize| rows == 1 || rows * shape.input <= SMALL_PRODUCT;
+    let suits = |rows: &usize| !small(*rows) && (shape.batch.is_multiple_of(*rows) || !small(shape.batch % rows));
+    let rows = (shape.rows_per_task(shape.batch)..shape.batch).find(suits).unwrap_or(shape.batch.max(1));
     let one = |member: usize, dx: &mut [f32]| {
         dx.par_chunks_mut(rows * shape.input).enumerate().for_each(|(task, dx)| {
             let first = task * rows;

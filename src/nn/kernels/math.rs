@@ -46,6 +46,12 @@ pub fn softplus(x: f32) -> f32 {
     x.max(0.0) + 2.0 * z * series
 }
 
+/// max(0, x); unlike `max`, it lets NaN through.
+#[inline(always)]
+pub(crate) fn relu(x: f32) -> f32 {
+    if x < 0.0 { 0.0 } else { x }
+}
+
 #[inline(always)]
 pub(crate) fn silu(x: f32) -> f32 {
     x / (1.0 + exp(-x))

@@ -22,7 +22,7 @@ pub(crate) use activation::activate;
 pub use activation::{Activation, add_and_activate, through_activation};
 pub use dense::{DenseShape, dense, dense_input_gradient, dense_parameter_gradients};
 pub use math::{exp, sigmoid, softplus, tanh};
-pub(crate) use math::{mish, mish_slope, silu, silu_slope};
+pub(crate) use math::{mish, mish_slope, relu, silu, silu_slope};
 pub use matrix::{Matrix, matmul, matmul_into};
 
 /// Runs a loop compiled for the widest vectors of this processor, if the compiler inlines it.

@@ -32,8 +32,7 @@ const COLOURED: [&str; PALETTE.len()] = ["oracle", "pets", "dreamer", "sac", "pl
 
 /// The methods of a task, each with its colour.
 fn methods(tables: &Tables, task: &str) -> Result<Vec<(RGBColor, String)>> {
-    let of_task = tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task).map(|(_, method)| method);
-    let of_task: Vec<String> = of_task.collect();
+    let of_task = tables.methods(task)?;
     let left = COLOURED.iter().zip(PALETTE).filter(|(known, _)| !of_task.iter().any(|method| method == *known));
     let mut left = left.map(|(_, colour)| colour).collect::<Vec<_>>().into_iter();
     let mut colour_of = |method: &String| match COLOURED.iter().position(|known| known == method) {

@@ -12,8 +12,8 @@ use super::provenance;
 use super::replays;
 use super::starts::Starts;
 use super::tables::Tables;
-use super::verdict::verdict;
-use crate::error::{Result, shortened};
+use super::verdict::{listed, verdict};
+use crate::error::{Error, Result, shortened};
 use crate::files;
 
 /// A temporary file that is older than this is nobody's any more.
@@ -23,7 +23,7 @@ const ABANDONED: Duration = Duration::from_secs(3600);
 /// page that needs no other file, `report.html`, into the folder `to`. Returns the table of results as text.
 ///
 /// # Errors
-/// If a table is missing or damaged, if `to` holds the tables of another study, or if a file cannot be written.
+/// If a table is missing or damaged, if `to` is another folder that holds the tables of a study, or if a file cannot be written.
 pub fn write(from: &Path, to: &Path) -> Result<String> {
     write_noting(from, to, &mut |_| ())
 }
@@ -34,8 +34,12 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
 /// As [`write()`].
 pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String)) -> Result<String> {
     let tables = Tables::read(from)?;
-    if !same_folder(from, to) {
-        tables.check_place(to)?;
+    if !same_folder(from, to) && to.join("tests.csv").exists() {
+        // Its summary and figures would be replaced by those of other numbers.
+        return Err(Error::Config(format!(
+            "{}: this folder holds a study of its own; choose another --out",
+            to.display()
+        )));
     }
     for (run, reason) in tables.missing_runs()? {
         note(format!("left out: {} ({})", shortened(&run, 200), shortened(&reason, 300)));
@@ -118,15 +122,15 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
     }
     let told: Vec<String> = told.into_iter().collect();
     let mut text = String::from(
-        "All methods have the same tasks, observations and initial states. They are evaluated without exploration noise (planners still \
+        "All methods of a task start from the same initial states. They are evaluated without exploration noise (planners still \
          sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \
-         `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv` in the same folder; settings are listed at the end.\n",
+         the study's `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv`; settings are listed at the end.\n",
     );
     if !told.is_empty() {
         text += &format!(
             "\nThe methods do not have the same information: {} know{} the reward as a function{}. The other learning methods have \
              only the rewards that they receive.\n",
-            told.join(" and "),
+            listed(&told),
             if told.len() == 1 { "s" } else { "" },
             if told.iter().any(|method| method == "`oracle`") {
                 ", and `oracle` plans in the true simulator"
@@ -134,6 +138,9 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
                 ""
             },
         );
+    }
+    for difference in tables.differences_of_environments()? {
+        text += &format!("\n{difference}\n");
     }
     Ok(text)
 }
@@ -148,8 +155,8 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
     Ok(match fewest {
         f64::INFINITY => "No method here learns, so the only uncertainty is that of the test episodes.\n".into(),
         n if n < 5.0 => format!(
-            "Not very: a learning method has only {n:.0} seed{} here, too few for an interval over seeds to be trusted. Run \
-             `handful study --seeds 5` (or `--profile full`) before you conclude anything.\n",
+            "Not very: a learning method has only {n:.0} seed{} here, too few for a reliable interval over seeds. Train at least five seeds \
+             of every learning method before you draw conclusions.\n",
             if n == 1.0 { "" } else { "s" }
         ),
         n => format!(

@@ -18,18 +18,20 @@ pub(super) fn section(tables: &Tables) -> Result<String> {
          is the two-level bootstrap: seeds are drawn, then the episodes of each. With one seed (a method that does not learn needs only one), \
          and where all episodes have the same outcome, it is the Wilson interval, which covers the test episodes and not the differences \
          between seeds.\n\
-         - *{level:.0} % by step*: the first evaluation at which that success rate is reached, and held at the next if there is one; the \
-         median over seeds (a dash if the median seed does not get there within its budget). In brackets the median of the seconds until \
+         - *steps*: environment steps of training.\n\
+         - *{level:.0} % by step*: the first evaluation at which that success rate is reached and confirmed by the next one; the \
+         median over seeds (a dash if the median seed does not reach it within its budget). In brackets the median of the seconds until \
          then, evaluations included, on a machine that several runs shared.\n\
-         - *ms per action*: the time that choosing an action takes in the last evaluation, median over seeds.\n\
+         - *ms per action*: the time that choosing an action takes in the last evaluation, median over seeds. With action repeat, it is \
+         chosen for several steps.\n\
          - *SPARC*, *LDLJ*: spectral arc length and log dimensionless jerk of the hand's path; closer to zero is smoother.\n\
          - *area under the curve*: the mean success rate up to the smallest budget, with a t interval over seeds.\n\
          - *action change*: root mean square of the change from one action to the next in the test.\n\
-         - *optimism*: the return that was expected less the return that followed, over the size of the latter, in the last evaluation. \
+         - *optimism*: (expected - realised return) / |realised return| in the last evaluation. \
          Expected is what a value says (discounted), or what a plan predicts for its horizon (undiscounted), so only methods of one kind \
          compare. *Correlation* is that of the two over time steps.\n\
-         - *better*, *earlier*: the probability that a seed has more success in the test than one of `{BASELINE}`, or reaches \
-         {level:.0} % by an earlier step (probability of improvement; ties count one half).\n\n</details>\n",
+         - *better*, *earlier*: the probability that a seed has more test success than one of `{BASELINE}`, or reaches \
+         {level:.0} % by an earlier step (probability of improvement; ties, and pairs whose order censoring hides, count one half).\n\n</details>\n",
         markdown(&rows(tables)?)
     ))
 }

@@ -39,8 +39,8 @@ pub(super) fn section(tables: &Tables, task: &str, differ: bool, replays: &[Repl
         file,
         "The test: success rate of each seed (small dots), their mean with its 95 % interval, and smoothness of the hand",
     );
-    text += &replays::table(replays, task);
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+    text += &replays::table(replays, task, &tables.methods(task)?);
+    for method in tables.methods(task)? {
         text += &diagnostics(tables, task, &method, to)?;
     }
     Ok(text)
@@ -71,7 +71,7 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
 /// The results of a task in words.
 fn findings(tables: &Tables, task: &str) -> Result<String> {
     let mut text = String::new();
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+    for method in tables.methods(task)? {
         let value = |column: &str| tables.value(task, &method, column);
         let (success, level) = (100.0 * value("success")?.unwrap_or(0.0), 100.0 * LEVEL);
         let (Some(budget), Some(reaching), Some(seeds)) =
@@ -108,7 +108,7 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
 /// The numbers of the methods that learn a task which the first table has no room for.
 fn details(tables: &Tables, task: &str) -> Result<String> {
     let mut rows = String::new();
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+    for method in tables.methods(task)? {
         let value = |column: &str| tables.value(task, &method, column);
         if value("steps")?.is_none() {
             continue;
@@ -161,7 +161,11 @@ fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<Str
             }
         )
     } else {
-        format!(" From the same test starts, its episodes and those of `{BASELINE}` show no spread to compare.")
+        format!(
+            " Success from the same test starts, minus that of `{BASELINE}`: {:+.0} percentage points, without an interval: all test episodes \
+             of a method have the same outcome.",
+            (100.0 * difference).round() + 0.0
+        )
     };
     let level = 100.0 * LEVEL;
     match (value("sac_steps_ratio")?, ends("sac_steps_ratio")?) {
@@ -196,7 +200,7 @@ fn evaluations(tables: &Tables, task: &str, differ: bool) -> Result<String> {
     let Some((_, first)) = grids.first() else { return Ok(String::new()) };
     if !differ {
         return Ok(format!(
-            "\nEvaluations: {}. A step by which {:.0} % success is reached is late by up to the distance of two.\n",
+            "\nEvaluations: {}. The true step of {:.0} % success may be up to one evaluation interval earlier.\n",
             one(first),
             100.0 * LEVEL
         ));
@@ -229,7 +233,7 @@ pub(super) fn grids_differ(tables: &Tables, task: &str) -> Result<bool> {
 /// Of each method that learns a task, the steps and numbers of episodes of each seed's evaluations.
 fn grids(tables: &Tables, task: &str) -> Result<Vec<(String, Vec<Curve>)>> {
     let mut grids: Vec<(String, Vec<Curve>)> = Vec::new();
-    for (_, method) in tables.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+    for method in tables.methods(task)? {
         grids.push((method.clone(), tables.evaluation_grid(task, &method)?));
     }
     grids.retain(|(_, seeds)| !seeds.is_empty());

@@ -8,6 +8,7 @@ use std::path::Path;
 use polars::prelude::*;
 
 mod admission;
+mod frames;
 mod gather;
 mod join;
 mod place;
@@ -20,6 +21,8 @@ use super::summary::summarise;
 use crate::chart::LARGEST;
 use crate::error::{Error, Result};
 use crate::files;
+use frames::csv;
+pub(super) use frames::{by_run, curves, lists, numbers, of, optional_curves, strings};
 #[cfg(feature = "cli")]
 pub(crate) use place::check_place;
 pub use runs::Run;
@@ -116,14 +119,21 @@ impl Tables {
     /// # Errors
     /// If a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
-        write(&folder.join("evaluations.csv"), &self.evaluations)?;
-        write(&folder.join("models.csv"), &self.models)?;
-        write(&folder.join("values.csv"), &self.values)?;
-        write(&folder.join("tests.csv"), &self.tests)?;
-        write(&folder.join("runs.csv"), &self.runs)?;
         let left_out = folder.join("left_out.csv");
+        let mut tables = vec![
+            (folder.join("evaluations.csv"), csv(&self.evaluations)?),
+            (folder.join("models.csv"), csv(&self.models)?),
+            (folder.join("values.csv"), csv(&self.values)?),
+            (folder.join("tests.csv"), csv(&self.tests)?),
+            (folder.join("runs.csv"), csv(&self.runs)?),
+        ];
         if self.left_out.width() > 0 {
-            return write(&left_out, &self.left_out);
+            tables.push((left_out.clone(), csv(&self.left_out)?));
+        }
+        // Together, since tables of different studies may look like those of one.
+        files::write_all(&tables.iter().map(|(path, bytes)| (path.as_path(), bytes.as_slice())).collect::<Vec<_>>())?;
+        if self.left_out.width() > 0 {
+            return Ok(());
         }
         // What an earlier attempt left behind.
         match std::fs::remove_file(&left_out) {
@@ -137,13 +147,25 @@ impl Tables {
     /// # Errors
     /// If it cannot be written.
     pub fn write_summary(&self, folder: &Path) -> Result<()> {
-        write(&folder.join("summary.csv"), &self.summary)
+        files::write(&folder.join("summary.csv"), &csv(&self.summary)?)
     }
 
     /// Tasks and methods, in the order in which they were run.
+    ///
+    /// # Errors
+    /// If the summary lacks a column.
     pub fn tasks_and_methods(&self) -> Result<Vec<(String, String)>> {
         let rows = |column: &str| strings(&self.summary, column).map_err(inside);
         Ok(rows("task")?.into_iter().zip(rows("method")?).collect())
+    }
+
+    /// The methods of a task, in the order in which they were run.
+    ///
+    /// # Errors
+    /// If the summary lacks a column.
+    pub fn methods(&self, task: &str) -> Result<Vec<String>> {
+        let all = self.tasks_and_methods()?.into_iter();
+        Ok(all.filter(|(of, _)| of == task).map(|(_, method)| method).collect())
     }
 
     /// The success curves of a method: for each seed, steps and success rates.
@@ -170,7 +192,7 @@ impl Tables {
         if self.evaluations.column("return_mean").is_err() {
             return Ok(false);
         }
-        for (_, method) in self.tasks_and_methods()?.into_iter().filter(|(of, _)| of == task) {
+        for method in self.methods(task)? {
             if self.curves(task, &method)?.iter().flat_map(|(_, success)| success).any(|success| *success > 0.0) {
                 return Ok(false);
             }
@@ -271,59 +293,6 @@ impl Tables {
         };
         found().map_err(inside)
     }
-}
-
-pub(super) fn of(frame: &DataFrame, task: &str, method: &str) -> PolarsResult<DataFrame> {
-    if frame.width() == 0 {
-        return Ok(frame.clone());
-    }
-    let here = col("task").eq(lit(task)).and(col("method").eq(lit(method)));
-    frame.clone().lazy().filter(here).collect()
-}
-
-/// Groups rows by run: one row per run, in the order of the runs, with each of these columns as a list.
-pub(super) fn by_run(rows: LazyFrame, columns: &[&str]) -> PolarsResult<DataFrame> {
-    let lists: Vec<Expr> = columns.iter().map(|name| col(*name).strict_cast(DataType::Float64).drop_nulls()).collect();
-    rows.group_by_stable(["task", "method", "seed"].map(col)).agg(lists).collect()
-}
-
-/// A column over environment steps, for each seed. What no chart can show is left out.
-pub(super) fn curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
-    if rows.width() == 0 {
-        return Ok(Vec::new());
-    }
-    let number = col(value).cast(DataType::Float64);
-    let shown = number.clone().gt_eq(lit(-LARGEST)).and(number.lt_eq(lit(LARGEST)));
-    let known = of(rows, task, method)?.lazy().filter(shown);
-    let runs = by_run(known, &["step", value])?;
-    Ok(lists(&runs, "step")?.into_iter().zip(lists(&runs, value)?).collect())
-}
-
-/// The same for a column that tables of earlier versions do not have: none of it then.
-pub(super) fn optional_curves(rows: &DataFrame, task: &str, method: &str, value: &str) -> PolarsResult<Vec<Curve>> {
-    if rows.column(value).is_ok() { curves(rows, task, method, value) } else { Ok(Vec::new()) }
-}
-
-pub(super) fn lists(runs: &DataFrame, column: &str) -> PolarsResult<Vec<Vec<f64>>> {
-    let numbers = |list: Series| Ok(list.f64()?.iter().flatten().collect());
-    runs.column(column)?.list()?.no_null_series_iter().map(numbers).collect()
-}
-
-pub(super) fn strings(frame: &DataFrame, column: &str) -> PolarsResult<Vec<String>> {
-    Ok(frame.column(column)?.str()?.iter().map(|s| s.unwrap_or_default().to_string()).collect())
-}
-
-fn numbers(frame: &DataFrame, column: &str) -> PolarsResult<Vec<Option<f64>>> {
-    let column = frame.column(column)?.cast(&DataType::Float64)?;
-    Ok(column.f64()?.iter().collect())
-}
-
-fn write(path: &Path, table: &DataFrame) -> Result<()> {
-    let mut bytes = Vec::new();
-    if table.width() > 0 {
-        CsvWriter::new(&mut bytes).finish(&mut table.clone()).map_err(inside)?;
-    }
-    files::write(path, &bytes)
 }
 
 /// An error in tables that could be read.

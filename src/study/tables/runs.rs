@@ -8,6 +8,7 @@ use polars::prelude::*;
 use super::{Tables, inside, numbers, strings};
 use crate::error::{Error, Result, shortened};
 use crate::study::config::upgrade_keys;
+use crate::study::folder::difference;
 
 /// Task, method and seed.
 pub(super) type RunName = (String, String, u64);
@@ -86,6 +87,43 @@ impl Tables {
                 None => by_name,
             }
         }))
+    }
+
+    /// Sentences that say which methods of a task do not have the same environment, or plan with another reward than the one that is
+    /// measured, as far as configurations are recorded.
+    ///
+    /// # Errors
+    /// If the table lacks a column, or a configuration is not TOML.
+    pub(in crate::study) fn differences_of_environments(&self) -> Result<Vec<String>> {
+        let mut sentences = Vec::new();
+        let mut first: BTreeMap<String, (String, toml::Table)> = BTreeMap::new();
+        let settings = settings(&self.runs()?)?;
+        for (task, method) in self.tasks_and_methods()? {
+            let of_method = |((of, name, _), _): &(&RunName, &toml::Table)| (of, name) == (&task, &method);
+            let Some((_, settings)) = settings.iter().find(of_method) else { continue };
+            let mut env = settings.get("env").and_then(toml::Value::as_table).cloned().unwrap_or_default();
+            let planned = env.remove("planning_reward");
+            let planned = planned.as_ref().and_then(toml::Value::as_str);
+            let measured = env.get("reward").and_then(toml::Value::as_str);
+            if let Some(planned) = planned.filter(|planned| Some(*planned) != measured)
+                && self.is_told_the_reward(&task, &method)?
+            {
+                sentences.push(format!(
+                    "On `{task}`, `{method}` plans with another reward (`{planned}`) than the one that is measured and that the \
+                     others receive."
+                ));
+            }
+            match first.get(&task) {
+                None => _ = first.insert(task, (method, env)),
+                Some((other, theirs)) => {
+                    let how = difference(&env, theirs);
+                    sentences.extend(how.map(|how| {
+                        format!("**Not the same environment:** that of `{method}` on `{task}` is not that of `{other}` ({how}).")
+                    }));
+                }
+            }
+        }
+        Ok(sentences)
     }
 
     /// The seeds of each method that learns, by task and method.
