@@ -280,7 +280,7 @@ fn a_verdict_needs_four_seeds() {
     };
     let (four, three) = (of(&[20, 19, 20, 20]), of(&[20, 19, 20]));
     assert!(four.contains("Significantly more test success than `sac`: `pets`."), "{four}");
-    assert!(three.contains("Fewer than 4 seeds, too few for a test against `sac`: `pets`."), "{three}");
+    assert!(three.contains("Fewer than 4 seeds, too few to compare test success with `sac`: `pets`."), "{three}");
     let (fast, slow): (ByHand, ByHand) = (("pets", &[20; 4], 500, [500, 2000]), ("sac", &[20; 4], 1500, [500, 2000]));
     let folder = study_by_hand(&[fast, slow]);
     let report = report_in(folder.path());
@@ -350,8 +350,8 @@ fn a_summary_says_what_its_seeds_can_tell() {
         "| 1000 (12 s) | 2.5 |",
         "- **pole**\n  - `pets` is first to reach 80 % success, by step 500 (median). `pets` is told the reward function; of the \
          methods that are not, `dreamer` is first, by step 1000.\n  - Not every seed reaches 80 % within its budget, so no ratio of \
-         steps to `sac`: `dreamer`. Fewer than 4 seeds, too few for a test against `sac`: `pets`.\n  - Fewer than 4 seeds, too few for a test \
-         against `sac`: `dreamer`, `pets`.\n",
+         steps to `sac`: `dreamer`. Fewer than 4 seeds, too few to compare steps to 80 % with `sac`: `pets`.\n  - Fewer than 4 seeds, \
+         too few to compare test success with `sac`: `dreamer`, `pets`.\n",
         "one seed: the interval covers its test episodes, not what another seed would bring",
         "minus that of `sac`: +50 percentage points [",
         "takes at least 4.0 times as many steps",

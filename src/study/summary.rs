@@ -281,9 +281,10 @@ fn last_rows(rows: &DataFrame) -> PolarsResult<DataFrame> {
     if rows.width() == 0 {
         return Ok(rows.clone());
     }
-    let by_step = rows.clone().lazy().sort(["step"], SortMultipleOptions::default());
+    let in_order = SortMultipleOptions::default().with_maintain_order(true);
     let values = ["expected", "realised", "correlation"].map(|name| col(name).last());
-    by_step.group_by(["task", "method", "seed"].map(col)).agg(values).collect()
+    let by_step = rows.clone().lazy().sort(["step"], in_order);
+    by_step.group_by_stable(["task", "method", "seed"].map(col)).agg(values).collect()
 }
 
 /// The last value of each curve.

@@ -95,10 +95,11 @@ const SEEDS: f64 = 4.0;
 fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result<Vec<String>> {
     let mut points = Vec::new();
     let level = 100.0 * LEVEL;
-    for (column, none, better, worse, open) in [
+    for (column, none, measure, better, worse, open) in [
         (
             "sac_steps_ratio",
             1.0,
+            format!("steps to {level:.0} %"),
             format!("Significantly fewer steps to {level:.0} % than"),
             format!("Significantly more steps to {level:.0} % than"),
             format!("No significant difference in steps to {level:.0} % from"),
@@ -106,13 +107,14 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
         (
             "success_minus_sac",
             0.0,
+            "test success".into(),
             "Significantly more test success than".into(),
             "Significantly less test success than".into(),
             "No significant difference in test success from".into(),
         ),
     ] {
         let unknown = format!("Not every seed reaches {level:.0} % within its budget, so no ratio of steps to");
-        let few = format!("Fewer than {SEEDS:.0} seeds, too few for a test against");
+        let few = format!("Fewer than {SEEDS:.0} seeds, too few to compare {measure} with");
         let mut groups = [better, worse, open, unknown, few].map(|what| (what, Vec::new()));
         let seeds = |method| tables.value(task, method, "seeds").map(|seeds| seeds.unwrap_or(0.0));
         for method in learning.iter().filter(|method| **method != BASELINE) {
