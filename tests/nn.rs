@@ -94,6 +94,15 @@ fn a_layer_does_not_depend_on_the_number_of_threads() {
     }
 }
 
+/// Two networks, two rows each: the loss of a network is its mean over the rows, and those of both are added.
+#[test]
+fn networks_learn_as_if_they_were_alone() {
+    let two = tensor(&device(), vec![1.0, 3.0, 5.0, 7.0], (2, 2, 1));
+    let total = ops::total(OwnedTape::default(), &[(1.0, two.clone())]);
+    assert_eq!(total.array(), 2.0 + 6.0);
+    assert_eq!(**total.backward().get_or_alloc_mut(&two).expect("memory"), [0.5; 4]);
+}
+
 #[test]
 fn what_is_not_a_number_stays_so() {
     for activation in [Activation::Identity, Activation::Relu, Activation::Silu, Activation::Mish] {

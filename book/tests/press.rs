@@ -246,8 +246,9 @@ fn numbers_from_studies_are_quoted_as_they_are() {
             format!("| {name} | {success} | {steps} | {by} ({reaching} of {seeds}) | {ratio} | {sparc:.1} |"),
         ));
     }
-    let reaching = ["pets", "sac", "tdmpc2"].map(|method| push(method, "seeds_reaching_80"));
-    assert_eq!(reaching, [5.0, 5.0, 4.0]);
+    let [seeds, reaching] =
+        ["seeds", "seeds_reaching_80"].map(|column| ["pets", "sac", "tdmpc2"].map(|method| push(method, column)));
+    assert_eq!((seeds, reaching), ([5.0; 3], [5.0, 5.0, 4.0]));
     let difference = |method: &str| {
         let [low, high] =
             ["success_minus_sac_t_low", "success_minus_sac_t_high"].map(|column| 100.0 * push(method, column));

@@ -26,8 +26,9 @@ const NOISE: f64 = 1e-3;
 /// let light = Pusher { mass: 0.05, friction: 0.3, ..Pusher::default() };
 /// let block = RecordedPush { hand: hand.clone(), block: start }.play(&light);
 ///
-/// let found = RecordedPush { hand, block }.identify(Pusher::default());
+/// let found = RecordedPush { hand, block }.identify(Pusher::default())?;
 /// assert!(found.residual < 1e-3, "{} m", found.residual);
+/// # Ok::<(), handful::error::Error>(())
 /// ```
 #[doc(alias = "system identification")]
 #[derive(Clone, Debug, Default, PartialEq)]

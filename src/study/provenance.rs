@@ -4,10 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
 use super::folder::BETWEEN_VERSIONS;
-use super::names::excerpt;
 use super::starts::Starts;
 use super::tables::{Run, Tables};
-use crate::error::Result;
+use crate::error::{Result, shortened};
 use crate::watch::escaped;
 
 /// The fewest seeds, and episodes of a test, that a comparison should have.
@@ -109,7 +108,7 @@ pub(super) fn configurations(tables: &Tables) -> Result<String> {
         let alike: Vec<&Run> =
             runs.iter().filter(|other| (&other.task, &other.method) == (&run.task, &run.method)).collect();
         let seeds: Vec<String> = alike.iter().map(|run| run.seed.to_string()).collect();
-        let versions: BTreeSet<String> = alike.iter().map(|run| escaped(&excerpt(&run.version))).collect();
+        let versions: BTreeSet<String> = alike.iter().map(|run| escaped(&shortened(&run.version, 200))).collect();
         let versions: Vec<String> = versions.into_iter().collect();
         let (of, version) = (if seeds.len() == 1 { "seed" } else { "seeds" }, versions.join(", "));
         write!(

@@ -102,6 +102,10 @@ impl<E: Env> Run<E> {
         let (env, evaluator) = (Checked::new(make()?), Evaluator::new(make)?);
         let folder = RunFolder::claim(folder, &config)?;
         let mut progress = folder.load(&config, &mut method)?.unwrap_or_default();
+        if progress.step > 0 && progress.versions.is_empty() {
+            // Its checkpoint does not say which.
+            progress.versions.insert("an earlier version".into());
+        }
         progress.versions.insert(SOURCE.clone());
         let mut run = Self {
             env,

@@ -113,8 +113,9 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
             "No significant difference in test success from".into(),
         ),
     ] {
-        let unknown = format!("Not every seed reaches {level:.0} % within its budget, so no ratio of steps to");
-        let few = format!("Fewer than {SEEDS:.0} seeds, too few to compare {measure} with");
+        let unknown =
+            format!("Not every seed reaches {level:.0} % after step 0 and within its budget, so no ratio of steps to");
+        let few = format!("Fewer than {SEEDS:.0} seeds of one of the two, too few to compare {measure} with");
         let mut groups = [better, worse, open, unknown, few].map(|what| (what, Vec::new()));
         let seeds = |method| tables.value(task, method, "seeds").map(|seeds| seeds.unwrap_or(0.0));
         for method in learning.iter().filter(|method| **method != BASELINE) {

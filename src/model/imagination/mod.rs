@@ -175,8 +175,8 @@ impl Imagination<'_> {
     /// threads.
     ///
     /// # Panics
-    /// If there is no horizon or no particle, the sizes do not fit together, the particles are not a multiple of the members, or the reward is
-    /// [`Reward::Learned`] and the model has not learned rewards.
+    /// If there is no horizon or no particle, the sizes do not fit together, the particles are not a multiple of the members, or the
+    /// reward is [`Reward::Learned`] and the model has not learned rewards.
     #[doc(alias = "CRN")]
     #[doc(alias = "common random numbers")]
     pub fn imagined_returns(&self, obs: &[f32], actions: &[f32], horizon: usize, rng: &mut Rng) -> ImaginedReturns {

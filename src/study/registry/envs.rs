@@ -140,7 +140,8 @@ impl<E: Env, O: Settings> EnvEntry<E, O> {
         self
     }
 
-    /// There is a hand-written policy for it.
+    /// There is a hand-written policy for it. Where the options rule it out, `policy` returns [`Error::Unsupported`]: a study whose methods
+    /// nobody named leaves it out then, while any other error ends the study.
     #[must_use]
     pub fn with_scripted(mut self, policy: impl Fn(&O) -> Result<Scripted> + Send + Sync + 'static) -> Self {
         self.scripted = Some(Arc::new(policy));

@@ -162,8 +162,8 @@ fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<Str
         )
     } else {
         format!(
-            " Success from the same test starts, minus that of `{BASELINE}`: {:+.0} percentage points, without an interval: all test episodes \
-             of a method have the same outcome.",
+            " Success from the same test starts, minus that of `{BASELINE}`: {:+.0} percentage points, without an interval: resampling \
+             shows no spread.",
             (100.0 * difference).round() + 0.0
         )
     };

@@ -21,7 +21,7 @@ pub fn probability_of_improvement(first: &[f64], second: &[f64], rng: &mut Rng) 
 pub enum Time {
     /// By this step.
     Reached(f64),
-    /// Right-censored: not within so many steps.
+    /// Right-censored: not before this step. It may have been reached there, if no later evaluation could confirm it.
     Censored(f64),
 }
 
@@ -38,7 +38,7 @@ pub enum Time {
 pub fn probability_of_being_earlier(first: &[Time], second: &[Time], rng: &mut Rng) -> (f64, [f64; 2]) {
     let is_earlier = |a: &Time, b: &Time| match (a, b) {
         (Time::Reached(a), Time::Reached(b)) => a < b,
-        (Time::Reached(a), Time::Censored(budget)) => a <= budget,
+        (Time::Reached(a), Time::Censored(budget)) => a < budget,
         (Time::Censored(_), _) => false,
     };
     probability_of_winning(first, second, is_earlier, rng)

@@ -185,10 +185,11 @@ pub fn ratio_t_interval(first: &[f64], second: &[f64]) -> Option<[f64; 2]> {
 
 /// The 97.5 % quantile of Student's t distribution for the mean of two or more values.
 fn t_quantile(values: usize) -> Option<f64> {
-    /// For 1 to 9 degrees of freedom.
-    const QUANTILES: [f64; 9] = [12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622];
+    /// For 1 to 11 degrees of freedom.
+    const QUANTILES: [f64; 11] =
+        [12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622, 2.2281, 2.2010];
     let freedom = values.checked_sub(1).filter(|freedom| *freedom > 0)?;
-    // From ten on, the first terms of its expansion in their reciprocal (Abramowitz & Stegun 1964, 26.7.5) are exact to 1e-4.
+    // From twelve on, the first terms of its expansion in their reciprocal (Abramowitz & Stegun 1964, 26.7.5) are exact to 1e-4.
     let (n, z) = (freedom as f64, Z);
     let expansion = z
         + (z.powi(3) + z) / (4.0 * n)

@@ -109,8 +109,8 @@ impl Tables {
                 && self.is_told_the_reward(&task, &method)?
             {
                 sentences.push(format!(
-                    "On `{task}`, `{method}` plans with another reward (`{planned}`) than the one that is measured and that the \
-                     others receive."
+                    "On `{task}`, `{method}` knows another reward (`{planned}`) than the one that is measured and that the others \
+                     receive."
                 ));
             }
             match first.get(&task) {
