@@ -15,17 +15,27 @@ pub(super) struct Held {
 impl Held {
     /// The action of the next time step; `decide` is asked for one when the last has been held for `steps` of them.
     pub fn next(&mut self, steps: usize, decide: impl FnOnce() -> Vec<f32>) -> Vec<f32> {
-        if self.left == 0 {
-            self.action = decide();
-            self.left = steps;
+        if self.is_due() {
+            self.begin(decide(), steps);
         }
-        self.left -= 1;
-        self.action.clone()
+        self.advance()
     }
 
     /// Whether the next time step needs a decision.
     pub fn is_due(&self) -> bool {
         self.left == 0
+    }
+
+    /// Begins to hold `action`, for `steps` time steps.
+    pub fn begin(&mut self, action: Vec<f32>, steps: usize) {
+        self.action = action;
+        self.left = steps;
+    }
+
+    /// The action of the next time step, for which no decision is due.
+    pub fn advance(&mut self) -> Vec<f32> {
+        self.left -= 1;
+        self.action.clone()
     }
 
     /// The action before the next decision: `size` zeros before the first one of an episode.

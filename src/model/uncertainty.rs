@@ -125,7 +125,7 @@ ranges!(enum Risk {
 impl Risk {
     /// The score of these returns; NaN if one of them is, or if there are none.
     pub fn of(self, returns: &[f32]) -> f32 {
-        if returns.is_empty() || returns.iter().any(|r| r.is_nan()) {
+        if returns.is_empty() {
             return f32::NAN;
         }
         let n = returns.len() as f32;
@@ -135,6 +135,8 @@ impl Risk {
             Risk::MeanStd(weight) => {
                 mean - weight * (returns.iter().map(|r| (r - mean).powi(2)).sum::<f32>() / n).sqrt()
             }
+            // Sorting puts NaN among the best, or among the worst.
+            Risk::Cvar(_) if mean.is_nan() => f32::NAN,
             Risk::Cvar(fraction) => {
                 let count = ((fraction * n).ceil() as usize).clamp(1, returns.len());
                 let mut sorted = returns.to_vec();

@@ -331,7 +331,7 @@ pub fn mean(x: &Tensor3) -> f32 {
 /// The sum of several losses `[members, batch, 1]`, each times a weight: what is differentiated. The loss of a network is its mean over
 /// the batch; those of several networks are added, so that the gradient of each is the same as if it were alone.
 pub fn total<T: Tape<f32, Cpu>>(mut tape: T, losses: &[(f32, Tensor3)]) -> Tensor<Rank0, f32, Cpu, T> {
-    let of_networks = |loss: &Tensor3| loss.shape().0 as f32 * mean(loss);
+    let of_networks = |loss: &Tensor3| values(loss).iter().sum::<f32>() / loss.shape().1 as f32;
     let sum: f32 = losses.iter().map(|(weight, loss)| weight * of_networks(loss)).sum();
     let y = super::device().tensor(sum);
     if T::OWNS_TAPE {

@@ -113,11 +113,11 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
             "No significant difference in test success from".into(),
         ),
     ] {
-        let unknown =
-            format!("Not every seed reaches {level:.0} % after step 0 and within its budget, so no ratio of steps to");
+        let late = format!("Not every seed reaches {level:.0} % within its budget, so there is no ratio of steps to");
+        let at_once = format!("Some seeds are at {level:.0} % at step 0, so there is no ratio of steps to");
         let few = format!("Fewer than {SEEDS:.0} seeds of one of the two, too few to compare {measure} with");
-        let mut groups = [better, worse, open, unknown, few].map(|what| (what, Vec::new()));
-        let seeds = |method| tables.value(task, method, "seeds").map(|seeds| seeds.unwrap_or(0.0));
+        let mut groups = [better, worse, open, late, at_once, few].map(|what| (what, Vec::new()));
+        let count = |method, of| tables.value(task, method, of).map(|seeds| seeds.unwrap_or(0.0));
         for method in learning.iter().filter(|method| **method != BASELINE) {
             let end = |which: &str, of: fn(f64, f64) -> f64| -> Result<Option<f64>> {
                 let bootstrap = tables.value(task, method, &format!("{column}_{which}"))?;
@@ -125,8 +125,9 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
                 Ok(bootstrap.map(|end| student.map_or(end, |other| of(end, other))))
             };
             let group = match (end("low", f64::min)?, end("high", f64::max)?) {
-                (None, None) => 3,
-                _ if seeds(method)?.min(seeds(BASELINE)?) < SEEDS => 4,
+                (None, None) if count(method, "seeds_reaching_80")? < count(method, "seeds")? => 3,
+                (None, None) => 4,
+                _ if count(method, "seeds")?.min(count(BASELINE, "seeds")?) < SEEDS => 5,
                 (Some(low), _) if low > none => 0,
                 (_, Some(high)) if high < none => 1,
                 _ => 2,

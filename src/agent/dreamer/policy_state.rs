@@ -61,10 +61,11 @@ impl PolicyState {
     /// The next action: a new decision when the last one has been held for long enough. It is the planner's if there is one, else
     /// the policy's mean plus `noise` times its standard deviation; without noise, the mean.
     pub fn act(&mut self, networks: &Networks, obs: &[f32], noise: impl FnOnce() -> Option<Vec<f32>>) -> Vec<f32> {
-        let mut held = std::mem::take(&mut self.held);
-        let action = held.next(self.action_repeat, || self.decide(networks, obs, noise().as_deref()));
-        self.held = held;
-        action
+        if self.held.is_due() {
+            let action = self.decide(networks, obs, noise().as_deref());
+            self.held.begin(action, self.action_repeat);
+        }
+        self.held.advance()
     }
 
     fn decide(&mut self, networks: &Networks, obs: &[f32], noise: Option<&[f32]>) -> Vec<f32> {

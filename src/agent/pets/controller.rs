@@ -54,10 +54,11 @@ impl Controller {
         disagreement_bonus: f32,
         observer: &mut PlanObserver,
     ) -> Vec<f32> {
-        let mut held = std::mem::take(&mut self.held);
-        let action = held.next(model.config.action_repeat, || self.decide(model, obs, disagreement_bonus, observer));
-        self.held = held;
-        action
+        if self.held.is_due() {
+            let action = self.decide(model, obs, disagreement_bonus, observer);
+            self.held.begin(action, model.config.action_repeat);
+        }
+        self.held.advance()
     }
 
     /// The next decision from `obs`; plans in `model` when the last plan is used up.

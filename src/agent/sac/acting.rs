@@ -18,10 +18,11 @@ impl Agent for Sac {
         let repeat = self.config.action_repeat;
         match mode {
             Mode::Explore => {
-                let mut held = std::mem::take(&mut self.held);
-                let action = held.next(repeat, || self.explore(obs));
-                self.held = held;
-                action
+                if self.held.is_due() {
+                    let action = self.explore(obs);
+                    self.held.begin(action, repeat);
+                }
+                self.held.advance()
             }
             Mode::Evaluate => {
                 let action = self.modes(obs).remove(0);

@@ -23,8 +23,7 @@ pub(super) fn bodies(tabletop: &Tabletop) -> Vec<Body> {
         .map(|(x, y)| Primitive::cuboid([0.02, 0.02, 0.3875], [(half.x - 0.03) * x, (half.y - 0.03) * y, -0.4125]));
     let table = std::iter::once(Primitive::cuboid(half.into(), [0.0; 3])).chain(legs).collect();
     bodies.push(Body::solid("table", "#c9a97c", table));
-    // Before the first reset nothing is on the table.
-    if !tabletop.state.compact.is_empty() {
+    if tabletop.state.is_set_up() {
         bodies.extend(tabletop.task.drawn(&tabletop.state.setup));
     }
     bodies

@@ -118,6 +118,13 @@ pub struct TabletopState {
     compact: Vec<f32>,
 }
 
+impl TabletopState {
+    /// Whether the task has put its objects on the table: not before the first reset.
+    fn is_set_up(&self) -> bool {
+        !self.compact.is_empty()
+    }
+}
+
 impl Tabletop {
     /// The simulation under the task.
     pub fn physics(&self) -> &Physics {
@@ -261,7 +268,7 @@ impl Env for Tabletop {
 
     fn step(&mut self, action: &[f32]) -> Result<Step> {
         self.spec.check_action(action)?;
-        if self.state.compact.is_empty() {
+        if !self.state.is_set_up() {
             return Err(Error::action(&self.spec.name, "a step before the first reset; reset first"));
         }
         self.command(action);

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::activation::{activate_all, add_and_activate};
-use super::matrix::SMALL_PRODUCT;
+use super::matrix::sums_over_lanes;
 use super::{Activation, Matrix, matmul, vectorised};
 
 /// The sizes of a dense layer over several networks at once.
@@ -100,7 +100,7 @@ pub fn dense_input_gradient(dx: &mut [f32], dz: &[f32], w: &[f32], shape: DenseS
         Matrix::new(&dz[member * shape.batch * shape.output..][..shape.batch * shape.output], shape.output)
     };
     // No task may be so small that its sums are in another order, unless the whole product is: bits would depend on the threads.
-    let small = |rows: usize| rows == 1 || rows * shape.input <= SMALL_PRODUCT;
+    let small = |rows: usize| sums_over_lanes(rows, shape.input);
     let suits = |rows: &usize| !small(*rows) && (shape.batch.is_multiple_of(*rows) || !small(shape.batch % rows));
     let rows = (shape.rows_per_task(shape.batch)..shape.batch).find(suits).unwrap_or(shape.batch.max(1));
     let one = |member: usize, dx: &mut [f32]| {

@@ -45,7 +45,12 @@ impl<'a> Matrix<'a> {
 }
 
 /// Numbers of a product that `gemm` computes as sums over lanes, in another order than those of a larger one.
-pub(super) const SMALL_PRODUCT: usize = 256;
+const SMALL_PRODUCT: usize = 256;
+
+/// Whether `gemm` would split the sums of a product of this size over lanes, where both factors are contiguous along them.
+pub(super) fn sums_over_lanes(rows: usize, cols: usize) -> bool {
+    rows * cols <= SMALL_PRODUCT || rows == 1 || cols == 1
+}
 
 /// `out = a b`, or `out += a b`; `out` is row-major and contiguous. Single-threaded.
 pub fn matmul(out: &mut [f32], a: Matrix, b: Matrix, accumulate: bool) {
@@ -61,8 +66,7 @@ pub fn matmul_into(out: &mut [f32], row_stride: usize, a: Matrix, b: Matrix, acc
         return;
     }
     assert!(row_stride >= b.cols && out.len() >= (a.rows - 1) * row_stride + b.cols, "the product fits");
-    // The condition under which `gemm` splits sums over lanes.
-    if a.col_stride == 1 && b.row_stride == 1 && (a.rows * b.cols <= SMALL_PRODUCT || a.rows == 1 || b.cols == 1) {
+    if a.col_stride == 1 && b.row_stride == 1 && sums_over_lanes(a.rows, b.cols) {
         dots(out, row_stride, a, b, accumulate);
         return;
     }

@@ -127,19 +127,20 @@ impl Tables {
             (folder.join("tests.csv"), csv(&self.tests)?),
             (folder.join("runs.csv"), csv(&self.runs)?),
         ];
-        if self.left_out.width() > 0 {
+        let all_there = self.left_out.width() == 0;
+        if !all_there {
             tables.push((left_out.clone(), csv(&self.left_out)?));
         }
         // Together, since tables of different studies may look like those of one.
         files::write_all(&tables.iter().map(|(path, bytes)| (path.as_path(), bytes.as_slice())).collect::<Vec<_>>())?;
-        if self.left_out.width() > 0 {
-            return Ok(());
-        }
         // What an earlier attempt left behind.
-        match std::fs::remove_file(&left_out) {
-            Err(problem) if problem.kind() != ErrorKind::NotFound => Err(Error::io("remove", &left_out)(problem)),
-            _ => Ok(()),
+        if all_there
+            && let Err(problem) = std::fs::remove_file(&left_out)
+            && problem.kind() != ErrorKind::NotFound
+        {
+            return Err(Error::io("remove", &left_out)(problem));
         }
+        Ok(())
     }
 
     /// Writes `summary.csv` into a folder.
@@ -184,7 +185,8 @@ impl Tables {
         optional_curves(&self.evaluations, task, method, "return_mean").map_err(inside)
     }
 
-    /// Whether to judge a task by its return, because no method succeeds in any evaluation. False if the tables hold no returns.
+    /// True if no method succeeds in any evaluation of the task, so that reports compare returns instead; false if no returns were
+    /// recorded.
     ///
     /// # Errors
     /// If the table lacks a column.

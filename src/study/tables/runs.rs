@@ -66,27 +66,12 @@ impl Tables {
     pub fn is_told_the_reward(&self, task: &str, method: &str) -> Result<bool> {
         let mut runs = self.runs()?;
         runs.retain(|run| run.task == task && run.method == method);
-        let by_name = ["oracle", "pets"].contains(&method);
         let settings = settings(&runs)?;
-        if settings.is_empty() {
-            return Ok(by_name);
-        }
-        Ok(settings.values().any(|settings| {
-            let of = |path: &[&str]| path.iter().try_fold(settings, |table, name| table.get(*name)?.as_table());
-            match settings.get("agent").and_then(toml::Value::as_str) {
-                Some("oracle") => true,
-                Some("pets") => {
-                    let learns = of(&["pets", "ensemble"]).and_then(|table| table.get("learn_reward")?.as_bool());
-                    !learns.unwrap_or(false)
-                }
-                Some("sac") => {
-                    let relabelled = of(&["sac"]).and_then(|table| table.get("hindsight")?.as_float());
-                    relabelled.unwrap_or(0.0) > 0.0
-                }
-                Some(_) => false,
-                None => by_name,
-            }
-        }))
+        Ok(if settings.is_empty() {
+            is_told_by_name(method)
+        } else {
+            settings.values().any(|settings| is_told(settings, method))
+        })
     }
 
     /// Sentences that say which methods of a task do not have the same environment, or plan with another reward than the one that is
@@ -106,7 +91,7 @@ impl Tables {
             let planned = planned.as_ref().and_then(toml::Value::as_str);
             let measured = env.get("reward").and_then(toml::Value::as_str);
             if let Some(planned) = planned.filter(|planned| Some(*planned) != measured)
-                && self.is_told_the_reward(&task, &method)?
+                && is_told(settings, &method)
             {
                 sentences.push(format!(
                     "On `{task}`, `{method}` knows another reward (`{planned}`) than the one that is measured and that the others \
@@ -137,6 +122,29 @@ impl Tables {
         }
         Ok(seeds)
     }
+}
+
+/// Whether a run with these settings has the reward as a function.
+fn is_told(settings: &toml::Table, method: &str) -> bool {
+    let of = |path: &[&str]| path.iter().try_fold(settings, |table, name| table.get(*name)?.as_table());
+    match settings.get("agent").and_then(toml::Value::as_str) {
+        Some("oracle") => true,
+        Some("pets") => {
+            let learns = of(&["pets", "ensemble"]).and_then(|table| table.get("learn_reward")?.as_bool());
+            !learns.unwrap_or(false)
+        }
+        Some("sac") => {
+            let relabelled = of(&["sac"]).and_then(|table| table.get("hindsight")?.as_float());
+            relabelled.unwrap_or(0.0) > 0.0
+        }
+        Some(_) => false,
+        None => is_told_by_name(method),
+    }
+}
+
+/// The same where its settings are not recorded.
+fn is_told_by_name(method: &str) -> bool {
+    ["oracle", "pets"].contains(&method)
 }
 
 /// Every run was tested, and of a method that learns every run was evaluated.
