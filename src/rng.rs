@@ -78,6 +78,11 @@ pub fn normal(rng: &mut Rng) -> f64 {
     rng.sample(rand_distr::StandardNormal)
 }
 
+/// `count` samples from the standard normal distribution.
+pub fn normals(count: usize, rng: &mut Rng) -> Vec<f32> {
+    (0..count).map(|_| normal(rng) as f32).collect()
+}
+
 /// A sample from the standard normal distribution truncated to two standard deviations, by rejection.
 pub fn truncated_normal(rng: &mut Rng) -> f64 {
     loop {

@@ -67,7 +67,12 @@ impl Agent for Random {
 
     fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
         let Self { action_size, seed, slots: states, .. } = self;
-        let fresh = |index| rng::stream(*seed, &format!("random agent, slot {index}"));
+        // By the initial observation, since episodes that are evaluated one after the other share slots.
+        let start = |index: usize| {
+            let slot = slots.iter().find(|slot| slot.index == index).expect("a state is made for one of these slots");
+            crc32fast::hash(bytemuck::cast_slice(slot.obs))
+        };
+        let fresh = |index| rng::stream(*seed, &format!("random agent, slot {index}, start {:08x}", start(index)));
         states.states(slots, fresh).into_iter().map(|rng| random_action(*action_size, rng)).collect()
     }
 }

@@ -117,14 +117,14 @@ impl<M: OpenLoopModel> OpenLoopModel for &M {
 
 /// A model whose steps are decisions of `action_repeat` time steps each, for which an action is held.
 #[derive(Clone, Copy, Debug)]
-pub struct OfDecisions<M> {
+pub struct WithActionRepeat<M> {
     /// The model of decisions.
     pub model: M,
     /// Time steps of a decision.
     pub action_repeat: usize,
 }
 
-impl<M: OpenLoopModel> OpenLoopModel for OfDecisions<M> {
+impl<M: OpenLoopModel> OpenLoopModel for WithActionRepeat<M> {
     /// Actions that differ within a decision are averaged, and observations within it interpolated.
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>> {
         let repeat = self.action_repeat;
@@ -285,7 +285,7 @@ mod tests {
         let observations = (0..=20).map(|t| vec![sum(t)]).collect();
         let episode = Episode { observations, actions: actions.clone(), ..Episode::default() };
         let starts = [(&episode, 3), (&episode, 7)];
-        let model = OfDecisions { model: Adds, action_repeat: 3 };
+        let model = WithActionRepeat { model: Adds, action_repeat: 3 };
         let futures = model.open_loop_predictions(&starts, 11, &mut rng::stream(0, "decisions"));
         for (k, future) in futures.iter().enumerate() {
             let expected = [sum(3 + k), sum(7 + k)];

@@ -161,7 +161,7 @@ impl Mlp {
     }
 
     /// Some of the networks, with tensors of their own.
-    pub fn some(&self, cpu: &Cpu, members: &[usize]) -> Self {
+    pub fn subset(&self, cpu: &Cpu, members: &[usize]) -> Self {
         let taken = |parameter: &Tensor3| {
             let &(all, rows, columns) = parameter.shape();
             let own: Vec<&[f32]> = values(parameter).chunks_exact(values(parameter).len() / all).collect();

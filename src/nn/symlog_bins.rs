@@ -50,7 +50,7 @@ impl SymlogBins {
     }
 
     /// Whether `x` lies within the outermost bins, so that it can be represented.
-    pub fn hold(&self, x: f32) -> bool {
+    pub fn contains(&self, x: f32) -> bool {
         symlog(x).abs() <= self.limit
     }
 
@@ -179,7 +179,7 @@ mod tests {
                 assert!((decoded - back).abs() < 2e-5 * back.abs().max(1.0), "{x}: {decoded}, expected {back}");
             }
         }
-        assert!(bins.hold(-22_000.0) && !bins.hold(22_100.0));
+        assert!(bins.contains(-22_000.0) && !bins.contains(22_100.0));
         assert!(bins.encode(f32::NAN).1[0].is_nan());
         let logits = (0..101).map(|k| -((k - 55) as f32).powi(2) / 8.0).collect();
         let logits = tensor(&device(), logits, (1, 1, 101));

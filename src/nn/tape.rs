@@ -21,6 +21,7 @@
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
+use super::kernels::{sigmoid, softplus};
 use super::ops::{self, Tensor3};
 
 /// The operations of [`super::ops`] as methods of any tape. Inputs are tensors without a tape, or results of the same tape.
@@ -65,6 +66,16 @@ pub trait TapeOps: Tape<f32, Cpu> + Sized {
     /// [`ops::rowwise`]: a loss of each row that knows its own gradient, `[members, batch, 1]`.
     fn rowwise(&mut self, x: &Tensor3, loss: impl FnMut(usize, &[f32], &mut [f32]) -> f32) -> Tensor3 {
         self.record(x, |x| ops::rowwise(x, loss))
+    }
+
+    /// The binary cross-entropy between logits `[1, rows, 1]` and the target probability of each row, `softplus(logit) - target logit`:
+    /// `[1, rows, 1]`.
+    fn binary_cross_entropy(&mut self, logits: &Tensor3, target: impl Fn(usize) -> f32) -> Tensor3 {
+        self.rowwise(logits, |row, logit, slope| {
+            let target = target(row);
+            slope[0] = sigmoid(logit[0]) - target;
+            softplus(logit[0]) - target * logit[0]
+        })
     }
 }
 

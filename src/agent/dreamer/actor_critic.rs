@@ -137,7 +137,7 @@ impl ActorCritic {
         let mut features = vec![latent.features()];
         let mut actions = Vec::with_capacity(horizon);
         for t in 0..horizon {
-            let noise: Vec<f32> = (0..rows * self.actions).map(|_| rng::normal(rng) as f32).collect();
+            let noise = rng::normals(rows * self.actions, rng);
             let drawn = self.act(&features[t], Some(&noise));
             let clipped: Vec<f32> = drawn.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
             latent = world.imagine(&latent, &tensor(world.device(), clipped, (1, rows, self.actions)), rng);

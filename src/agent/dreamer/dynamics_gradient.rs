@@ -31,7 +31,7 @@ impl ActorCritic {
         let mut features = vec![latent.features()];
         let mut losses = Vec::with_capacity(horizon + 2);
         for t in 0..horizon {
-            let noise: Vec<f32> = (0..rows * self.actions).map(|_| rng::normal(rng) as f32).collect();
+            let noise = rng::normals(rows * self.actions, rng);
             let head = self.policy.on(tape, &features[t], Grad::Params);
             let action = tape.record(&head, |head| {
                 ops::map_rows(head, self.actions, |row, head, action, jacobian| {

@@ -51,7 +51,7 @@ use crate::checkpoint::Weights;
 use crate::env::Spec;
 use crate::error::{Error, Result};
 use crate::model::WorldModel;
-use crate::model::open_loop::{OfDecisions, OpenLoop, open_loop};
+use crate::model::open_loop::{OpenLoop, WithActionRepeat, open_loop};
 use crate::nn::{Adam, AdamConfig};
 use crate::replay::{Episode, SequenceReplay, Transition};
 use crate::rng::{self, Rng};
@@ -232,7 +232,7 @@ impl Diagnostics for Dreamer {
     }
 
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
-        let model = OfDecisions { model: &self.networks.world, action_repeat: self.config.action_repeat };
+        let model = WithActionRepeat { model: &self.networks.world, action_repeat: self.config.action_repeat };
         open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 

@@ -8,7 +8,7 @@ use super::{DynReward, Pets};
 use crate::agent::decision::in_decisions;
 use crate::agent::{Diagnostics, ValueEstimate};
 use crate::model::Imagination;
-use crate::model::open_loop::{OfDecisions, OpenLoop, Propagated, open_loop};
+use crate::model::open_loop::{OpenLoop, Propagated, WithActionRepeat, open_loop};
 use crate::model::uncertainty::Risk;
 use crate::plan::Iteration;
 use crate::replay::Episode;
@@ -25,7 +25,7 @@ impl Diagnostics for Pets {
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         let Some(dynamics) = &self.dynamics else { return Vec::new() };
         let model = Propagated { dynamics, propagation: self.config.propagation };
-        let model = OfDecisions { model, action_repeat: self.config.action_repeat };
+        let model = WithActionRepeat { model, action_repeat: self.config.action_repeat };
         open_loop(&model, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 

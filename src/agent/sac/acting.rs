@@ -25,7 +25,7 @@ impl Agent for Sac {
                 self.held.advance()
             }
             Mode::Evaluate => {
-                let action = self.modes(obs).remove(0);
+                let action = self.deterministic_actions(obs).remove(0);
                 self.slots.state(0, |_| Held::default()).next(repeat, || action)
             }
         }
@@ -33,7 +33,7 @@ impl Agent for Sac {
 
     fn act_batch(&mut self, slots: &[Slot]) -> Vec<Vec<f32>> {
         let observations: Vec<&[f32]> = slots.iter().map(|slot| slot.obs).collect();
-        let actions = self.modes(&observations.concat());
+        let actions = self.deterministic_actions(&observations.concat());
         let held = self.slots.states(slots, |_| Held::default());
         held.into_iter().zip(actions).map(|(held, action)| held.next(self.config.action_repeat, || action)).collect()
     }
@@ -60,7 +60,7 @@ impl Agent for Sac {
 
 impl Sac {
     /// The deterministic action tanh(mean) for each row of observations.
-    pub(super) fn modes(&self, observations: &[f32]) -> Vec<Vec<f32>> {
+    pub(super) fn deterministic_actions(&self, observations: &[f32]) -> Vec<Vec<f32>> {
         let head = self.policy.forward(self.observations(observations), Grad::Input);
         let actions = SquashedGaussian::from_head(head).mode();
         values(&actions).chunks(self.action_size).map(<[f32]>::to_vec).collect()

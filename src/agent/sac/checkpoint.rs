@@ -19,7 +19,7 @@ impl Diagnostics for Sac {
         let of_episode = |episode: &Episode| {
             let episode = &in_decisions(episode, self.config.action_repeat);
             let observations = episode.observations.concat();
-            let actions = self.modes(&observations).concat();
+            let actions = self.deterministic_actions(&observations).concat();
             let actions = tensor(&self.cpu, actions, (1, episode.observations.len(), self.action_size));
             let q = self.critics.forward(ops::join(self.observations(&observations), actions), Grad::Input);
             let values = q.min::<(usize, usize), Axis<0>>().as_vec();

@@ -281,7 +281,7 @@ impl Sac {
 
     /// Standard normal noise, `[1, rows, actions]`.
     fn noise(&mut self, rows: usize) -> Tensor3 {
-        let noise = (0..rows * self.action_size).map(|_| rng::normal(&mut self.rng) as f32).collect();
+        let noise = rng::normals(rows * self.action_size, &mut self.rng);
         tensor(&self.cpu, noise, (1, rows, self.action_size))
     }
 }

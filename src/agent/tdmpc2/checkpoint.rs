@@ -8,7 +8,7 @@ use crate::agent::{Checkpoint, Diagnostics, ValueEstimate};
 use crate::checkpoint::Weights;
 use crate::error::Result;
 use crate::model::Probed;
-use crate::model::open_loop::{OfDecisions, OpenLoop, open_loop};
+use crate::model::open_loop::{OpenLoop, WithActionRepeat, open_loop};
 use crate::nn::copy_parameters;
 use crate::replay::Episode;
 use crate::rng;
@@ -21,7 +21,7 @@ impl Diagnostics for TdMpc2 {
     /// Predictions are those of the latent dynamics, read out by the probe.
     fn open_loop(&self, episodes: &[Episode]) -> Vec<OpenLoop> {
         let Networks { model, probe, .. } = &self.networks;
-        let predictor = OfDecisions { model: Probed { model, probe }, action_repeat: self.config.action_repeat };
+        let predictor = WithActionRepeat { model: Probed { model, probe }, action_repeat: self.config.action_repeat };
         open_loop(&predictor, &self.spec, episodes, &mut rng::stream(0, "open loop"))
     }
 

@@ -4,7 +4,7 @@ use super::TdMpc2Config;
 use crate::agent::decision::Held;
 use crate::agent::warm_up::RandomActions;
 use crate::env::Spec;
-use crate::model::implicit::{FrozenModel, ImplicitModel, normals};
+use crate::model::implicit::{FrozenModel, ImplicitModel};
 use crate::nn::values;
 use crate::plan::{ActionCosts, ActionSequences, GuidedMppi, Objective, PlanObserver, Planner, WithCosts};
 use crate::rng::{self, Rng};
@@ -31,13 +31,13 @@ impl<'a> LatentReturns<'a> {
 impl Objective for LatentReturns<'_> {
     /// Each call draws two critics, and an action for the last state of each sequence.
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32> {
-        let noise = normals(sequences.count() * sequences.actions, &mut self.rng);
+        let noise = rng::normals(sequences.count() * sequences.actions, &mut self.rng);
         let pair = two_of(self.critics, &mut self.rng);
         self.model.returns(&self.z, &sequences.values, sequences.horizon, &noise, pair, self.discount)
     }
 
     fn proposals(&mut self, count: usize, like: &ActionSequences) -> ActionSequences {
-        let noise = normals(count * like.horizon * like.actions, &mut self.rng);
+        let noise = rng::normals(count * like.horizon * like.actions, &mut self.rng);
         ActionSequences { values: self.model.policy_sequences(&self.z, like.horizon, &noise), ..like.clone() }
     }
 }

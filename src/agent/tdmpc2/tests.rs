@@ -106,7 +106,7 @@ fn an_update_is_the_references() {
 
     let encoded = NoneTape.rows(&z, 2, 4);
     let actions = policy.sample_on(&mut NoneTape, &encoded, &noise[..8], EntropyBonus::Gaussian).0;
-    let q = model.values(&target.some(&device(), &pair), &encoded, &actions);
+    let q = model.values(&target.subset(&device(), &pair), &encoded, &actions);
     let targets = update::bootstrapped(&batch, &q, 0.95, 1);
     targets.iter().zip([0.981_567, 0.452_613, 0.030_633, 0.663_528]).for_each(|(y, expected)| near("y", *y, expected));
 

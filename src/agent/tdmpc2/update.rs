@@ -6,10 +6,10 @@ use dfdx::prelude::*;
 use super::planning::two_of;
 use super::{Networks, RunningScale, TdMpc2, TdMpc2Config};
 use crate::agent::Losses;
-use crate::model::implicit::{normals, step_weights};
+use crate::model::implicit::step_weights;
 use crate::nn::{Grad, TapeOps, Tensor3, ops, polyak, values};
 use crate::replay::SequenceBatch;
-use crate::rng::Rng;
+use crate::rng::{self, Rng};
 
 impl TdMpc2 {
     /// One update on freshly drawn slices of `horizon` steps; `None` while no episode is that long. Returns the means of
@@ -32,7 +32,7 @@ impl TdMpc2 {
         losses.insert("value_loss", ops::mean(&loss.value));
         losses.insert("latent_drift", loss.drift(&encoded));
         losses.insert("target", targets.iter().sum::<f32>() / targets.len() as f32);
-        let beyond = targets.iter().filter(|target| !networks.model.bins().hold(**target)).count();
+        let beyond = targets.iter().filter(|target| !networks.model.bins().contains(**target)).count();
         losses.insert("targets_beyond_bins", beyond as f32 / targets.len() as f32);
         let mut gradients = ops::total(tape, &weighted).backward();
         losses.insert("model_gradient", self.model_optimiser.step(&mut networks.model, &mut gradients));
@@ -95,7 +95,7 @@ impl Networks {
         let obs_size = batch.obs.len() / (batch.length * batch.sequences);
         let encoded = model.encode(&batch.obs[batch.sequences * obs_size..]);
         let actions = policy.sample(&encoded, rng);
-        let pair = target.some(model.device(), &two_of(model.config().critics, rng));
+        let pair = target.subset(model.device(), &two_of(model.config().critics, rng));
         let q = model.values(&pair, &encoded, &actions);
         (encoded, bootstrapped(batch, &q, discount, n_step))
     }
@@ -117,7 +117,7 @@ impl Networks {
         scale: &mut RunningScale,
         rng: &mut Rng,
     ) -> PolicyLoss {
-        let noise = normals(z.shape().1 * self.actions, rng);
+        let noise = rng::normals(z.shape().1 * self.actions, rng);
         let pair = two_of(self.model.config().critics, rng);
         self.climb(tape, z, &noise, pair, sequences, config, scale)
     }
@@ -137,7 +137,7 @@ impl Networks {
         let Self { model, policy, .. } = self;
         let rows = z.shape().1;
         let (action, bonus) = policy.sample_on(tape, z, noise, config.entropy_bonus);
-        let pair = model.critics().some(model.device(), &pair);
+        let pair = model.critics().subset(model.device(), &pair);
         let input = tape.record(&action, |action| {
             let (action, tape) = action.split_tape();
             ops::join(z.clone().put_tape(tape), action)

@@ -45,7 +45,7 @@ impl CommonRandomNumbers {
         let noise = if propagation == Propagation::TsInfMean {
             vec![0.0; horizon * noise_per_step]
         } else {
-            (0..horizon * noise_per_step).map(|_| rng::normal(rng) as f32).collect()
+            rng::normals(horizon * noise_per_step, rng)
         };
         let mut order = Vec::with_capacity(horizon * particles);
         for _ in 0..horizon {

@@ -4,7 +4,6 @@ use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
 
 use super::{ImplicitConfig, ImplicitModel};
-use crate::nn::kernels::{sigmoid, softplus};
 use crate::nn::{Grad, TapeOps, Tensor3, tensor, values};
 use crate::replay::SequenceBatch;
 
@@ -104,18 +103,9 @@ impl ImplicitModel {
             value: tape.scale_rows(&value, &weights),
             termination: self.termination.as_ref().map(|head| {
                 let logits = head.on(tape, &ahead, Grad::Both);
-                binary_cross_entropy(tape, &logits, &batch.terminal[sequences..])
+                tape.binary_cross_entropy(&logits, |row| f32::from(batch.terminal[sequences + row]))
             }),
             latents,
         }
     }
-}
-
-/// The cross-entropy between logits `[1, rows, 1]` and whether it is so, `[rows]`.
-fn binary_cross_entropy<T: Tape<f32, Cpu>>(tape: &mut T, logits: &Tensor3, truth: &[bool]) -> Tensor3 {
-    tape.rowwise(logits, |row, logit, slope| {
-        let truth = f32::from(truth[row]);
-        slope[0] = sigmoid(logit[0]) - truth;
-        softplus(logit[0]) - truth * logit[0]
-    })
 }

@@ -41,7 +41,6 @@ use dfdx::tensor::Cpu;
 pub use config::ImplicitConfig;
 pub(crate) use frozen::FrozenModel;
 pub use loss::{ImplicitLoss, step_weights};
-pub(crate) use policy::normals;
 pub use policy::{EntropyBonus, PolicyPrior};
 pub use probe::{Probe, Probed};
 

@@ -51,7 +51,7 @@ impl PolicyPrior {
 
     /// Actions drawn in latent states `[1, rows, latent]`: `[1, rows, actions]`.
     pub fn sample(&self, z: &Tensor3, rng: &mut Rng) -> Tensor3 {
-        let noise = normals(z.shape().1 * self.actions, rng);
+        let noise = rng::normals(z.shape().1 * self.actions, rng);
         squashed(self.head.on(&mut NoneTape, z, Grad::Params), &noise)
     }
 
@@ -67,11 +67,6 @@ impl PolicyPrior {
         let head = self.head.on(tape, z, Grad::Params);
         (tape.record(&head, |head| squashed(head, noise)), entropy_bonus(tape, &head, noise, entropy))
     }
-}
-
-/// Standard normal numbers.
-pub(crate) fn normals(count: usize, rng: &mut Rng) -> Vec<f32> {
-    (0..count).map(|_| rng::normal(rng) as f32).collect()
 }
 
 /// The logarithm of the standard deviation, from a number of the head.

@@ -32,8 +32,8 @@ fn frozen_returns(residual: bool) {
     }
     let (count, horizon, discount, pair) = (45, 4, 0.9, [2, 0]);
     let z = model.encode(&env.reset(0));
-    let sequences: Vec<f32> = normals(count * horizon, &mut rng).iter().map(|a| a.tanh()).collect();
-    let noise = normals(count, &mut rng);
+    let sequences: Vec<f32> = rng::normals(count * horizon, &mut rng).iter().map(|a| a.tanh()).collect();
+    let noise = rng::normals(count, &mut rng);
     let column = |t: usize| {
         let actions = sequences.iter().skip(t).step_by(horizon).copied().collect();
         tensor(&device(), actions, (1, count, 1))
@@ -62,7 +62,7 @@ fn frozen_returns(residual: bool) {
             (column(t), model.rewards(&state, &column(t)))
         } else {
             let actions = policy.sample_on(&mut NoneTape, &state, &noise, EntropyBonus::Gaussian).0;
-            let critics = model.critics().some(model.device(), &pair);
+            let critics = model.critics().subset(model.device(), &pair);
             let q = model.values(&critics, &state, &actions);
             (actions, (0..count).map(|i| 0.5 * (q[i] + q[count + i])).collect())
         };
@@ -81,7 +81,7 @@ fn frozen_returns(residual: bool) {
     }
 
     // The policy's first actions, too.
-    let noise = normals(count * horizon, &mut rng);
+    let noise = rng::normals(count * horizon, &mut rng);
     let proposed = frozen.policy_sequences(values(&z), horizon, &noise);
     let first: Vec<f32> = noise.iter().step_by(horizon).copied().collect();
     let expected = policy.sample_on(&mut NoneTape, &start, &first, EntropyBonus::Gaussian).0;

@@ -5,7 +5,6 @@ use dfdx::tensor::Cpu;
 
 use super::{WorldModel, WorldModelConfig};
 use crate::model::Latent;
-use crate::nn::kernels::{sigmoid, softplus};
 use crate::nn::ops::{self, mean};
 use crate::nn::{Adam, Grad, TapeOps, Tensor3, tensor, values};
 use crate::replay::SequenceBatch;
@@ -86,7 +85,9 @@ impl WorldModel {
         let reward_logits = self.reward.on(tape, &features, Grad::Both);
         let reward = self.bins.loss(tape, &reward_logits, &[&batch.rewards]);
         let continuation_logits = self.continuation.on(tape, &features, Grad::Both);
-        let continuation = self.continuation_loss(tape, &continuation_logits, &batch.terminal);
+        let discount = self.config.discount();
+        let continues = |row: usize| if batch.terminal[row] { 0.0 } else { discount };
+        let continuation = tape.binary_cross_entropy(&continuation_logits, continues);
         let z = self.rssm.categorical();
         let dynamics = z.dynamics_kl(tape, &posterior, &prior, free_nats);
         let representation = z.representation_kl(tape, &posterior, &prior, free_nats);
@@ -126,16 +127,6 @@ impl WorldModel {
                 squares += error * error;
             }
             squares
-        })
-    }
-
-    /// Binary cross-entropy with the discount as target (0 at terminal states): `softplus(logit) - target logit`.
-    fn continuation_loss<T: Tape<f32, Cpu>>(&self, tape: &mut T, logits: &Tensor3, terminal: &[bool]) -> Tensor3 {
-        let discount = self.config.discount();
-        tape.rowwise(logits, |row, logit, slope| {
-            let target = if terminal[row] { 0.0 } else { discount };
-            slope[0] = sigmoid(logit[0]) - target;
-            softplus(logit[0]) - target * logit[0]
         })
     }
 
