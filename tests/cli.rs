@@ -36,10 +36,18 @@ fn a_study_does_not_replace_the_tables_of_another() {
     let other = "holds the tables of another study (with `";
     refused(here, &study(&["--out", "kept"]), &["kept", other, "choose another --out"]);
     assert_eq!(std::fs::read_dir(&tables).expect("a folder").count(), 1, "nothing was begun");
+    // One that is damaged may be all that there is, or another table may tell whose it is.
+    let whole = std::fs::read_to_string(&quick).expect("a table");
+    std::fs::write(tables.join("tests.csv"), whole.trim_end()).expect("a writable folder");
+    refused(here, &study(&["--out", "kept"]), &["tests.csv"]);
+    std::fs::copy(quick.with_file_name("runs.csv"), tables.join("runs.csv")).expect("a table");
+    refused(here, &study(&["--out", "kept"]), &["kept", other, "choose another --out"]);
 
     assert!(handful(here, &study(&["--out", "own"])).status.success());
     let debug = ["study", "--tasks", "pendulum", "--methods", "debug", "--seeds", "1", "--out", "own"];
-    assert!(handful(here, &debug).status.success(), "the folder of the first run is there");
+    let output = handful(here, &debug);
+    assert!(output.status.success(), "the folder of the first run is there");
+    assert!(text(&output.stderr).contains("own: 1 other complete run is there"), "{}", text(&output.stderr));
     std::fs::remove_dir_all(here.join("own/pendulum/debug")).expect("a folder");
     refused(here, &study(&["--out", "own"]), &["own", other]);
 }
@@ -88,10 +96,12 @@ fn bad_input_is_refused_in_one_line() {
     refused(here, &["study", "--seeds", "3..3"], &["no seeds", "3..3"]);
     refused(here, &["study", "--seeds", "0"], &["no seeds"]);
     refused(here, &["study", "--seeds", "few"], &["'few'", "--seeds", "a number of seeds"]);
-    refused(here, &["study", "--jobs", "0"], &["--jobs"]);
+    refused(here, &["study", "--jobs", "0"], &["--jobs", "at least 1"]);
+    refused(here, &["study", "--jobs", "-1"], &["'-1'", "--jobs", "a whole number"]);
     refused(here, &["study", "--tasks", "pendulum", "--methods", "scripted"], &["pendulum has no scripted policy"]);
     let beyond = ["it must lie in 0..1048576"];
     check(train(&["--steps", "-5"]), &["'-5'", "--steps", "a whole number"]);
+    check(train(&["--steps", "0"]), &["`steps` is 0, but debug learns"]);
     check(train(&["--steps", "1e3"]), &["'1e3'", "--steps", "a whole number"]);
     check(train(&["--seed", "-1"]), &["'-1'", "--seed", "a whole number"]);
     check(train(&["--seed", "99999999999999999999"]), &["--seed", "too large"]);
@@ -112,6 +122,8 @@ fn bad_input_is_refused_in_one_line() {
     check(train(&["--config", "kind.toml"]), &["kind.toml", "many"]);
     std::fs::write(here.join("zero.toml"), "[sac]\nbatch = 0\n").expect("a writable folder");
     check(train(&["--config", "zero.toml"]), &["`sac.batch` is 0", "1..=65536"]);
+    std::fs::write(here.join("other.toml"), "[pets]\nwarm_up = 5\n").expect("a writable folder");
+    check(train(&["--config", "other.toml"]), &["other.toml", "[pets] is for another kind of agent", "[sac]"]);
     std::fs::write(here.join("broken.toml"), "[sac\n").expect("a writable folder");
     check(train(&["--config", "broken.toml"]), &["broken.toml"]);
     check(train(&["--config", "missing.toml"]), &["cannot read missing.toml"]);
@@ -319,9 +331,15 @@ fn train_evaluate_and_watch() {
     let said = text(&shaken.stderr);
     assert!(shaken.status.code() == Some(2) && said.contains("another run (its `shake` is"), "{said}");
 
-    // A checkpoint that is not one of ours.
+    // Weights that are not ours: the checkpoint has them, too.
     std::fs::write(here.join("run/weights.safetensors"), b"something else").expect("a writable folder");
-    refused(here, &["evaluate", "--run", "run"], &["weights.safetensors", "damaged"]);
+    refused(
+        here,
+        &["evaluate", "--run", "run"],
+        &["weights.safetensors", "the command that made the run writes it anew"],
+    );
+    std::fs::remove_dir_all(here.join("run/checkpoint")).expect("a checkpoint");
+    refused(here, &["evaluate", "--run", "run"], &["weights.safetensors", "damaged", "restore it"]);
 }
 
 /// The program ends as if all had been read, or says in one line what could not be written.

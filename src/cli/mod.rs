@@ -22,12 +22,13 @@ use console::style;
 
 use self::output::note;
 use crate::error::{Error, Result};
-use crate::rng::read_shake;
+use crate::rng::{read_shake, shake};
+use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 
 /// Model-based reinforcement learning on a robot arm. Without a command: the quick study.
 #[derive(Parser)]
-#[command(version, about)]
+#[command(version)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -47,6 +48,16 @@ enum Command {
     Watch(watch::Args),
 }
 
+/// Starts with other random numbers than those of the run would be other starts.
+fn note_other_shake(config: &RunConfig) {
+    if config.shake != shake() {
+        note(format_args!(
+            "this run was made with HANDFUL_SHAKE={}: without it, seeds have other starts",
+            config.shake
+        ));
+    }
+}
+
 /// Carries out the command that the program was called with. The answer is the program's exit code: 0, 2 after an error,
 /// 130 after an interruption.
 pub fn main(registry: &Registry) -> ExitCode {
@@ -59,7 +70,7 @@ pub fn main(registry: &Registry) -> ExitCode {
         }
         Err(problem) => problem.exit(),
     };
-    let outcome = read_shake().and_then(|_| match cli.command {
+    let outcome = read_shake().and_then(|_| begin_threads()).and_then(|()| match cli.command {
         None => study::run(registry, study::Args::default()),
         Some(Command::Study(args)) => study::run(registry, args),
         Some(Command::Train(args)) => train::run(registry, args),
@@ -78,6 +89,12 @@ pub fn main(registry: &Registry) -> ExitCode {
             ExitCode::from(2)
         }
     }
+}
+
+/// The threads that all commands share.
+fn begin_threads() -> Result<()> {
+    let threads = rayon::ThreadPoolBuilder::new().build_global();
+    threads.map_err(|problem| Error::Config(format!("cannot start threads ({problem}); lower RAYON_NUM_THREADS")))
 }
 
 /// A number on the command line.

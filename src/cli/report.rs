@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 #[cfg(feature = "study")]
 use super::output::{answer, note};
-#[cfg(feature = "study")]
 use super::refuse_folder_of;
 use crate::error::{Error, Result};
 #[cfg(feature = "study")]
@@ -22,7 +21,8 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Result<()> {
     match (args.from.as_slice(), &args.out) {
-        ([from], out) => write(from, out.as_ref().unwrap_or(from)),
+        ([from], None) => write(from, from),
+        ([from], Some(out)) => refuse_folder_of("run", "config.toml", out).and_then(|()| write(from, out)),
         (studies, Some(out)) => join(studies, out),
         (_, None) => {
             Err(Error::Config("several studies are joined in a folder of their own: say which with --out".into()))

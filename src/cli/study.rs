@@ -1,19 +1,21 @@
 //! `study`: compare methods on tasks.
 
-use std::num::NonZeroUsize;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use indicatif::HumanDuration;
 
 use super::output::{answer, note};
 use super::progress::Progress;
-use super::{refuse_folder_of, stop_on_ctrl_c};
+use super::{refuse_folder_of, stop_on_ctrl_c, whole};
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 use crate::study::run::check_run;
+#[cfg(feature = "study")]
+use crate::study::run::is_complete;
 use crate::study::runner::{self, Profile, StudyPlan};
 use crate::study::starts::Starts;
 use crate::study::status::{RunState, RunStatus, status, time_left};
@@ -23,21 +25,22 @@ pub(super) struct Args {
     /// Size of the study
     #[arg(long, value_enum, default_value_t = ProfileArg::Quick)]
     profile: ProfileArg,
-    /// Tasks, separated by commas; each then has the full budget of its presets, also in the quick profile
+    /// Tasks, separated by commas; each then has the full budget of its presets, also in the quick profile [default: reach; in
+    /// the full profile reach,push,lift]
     #[arg(long, value_delimiter = ',')]
     tasks: Option<Vec<String>>,
-    /// Methods, separated by commas
+    /// Methods, separated by commas [default: all with a preset that are compared, see the README]
     #[arg(long, value_delimiter = ',')]
     methods: Option<Vec<String>>,
-    /// How many seeds, or a range like 0..5
+    /// How many seeds, or a range like 0..5 [default: 2, in the full profile 5]
     #[arg(long, value_parser = seed_range, allow_negative_numbers = true)]
     seeds: Option<Range<u64>>,
     /// Initial states of evaluations and test: test, or development for tuning
     #[arg(long)]
     starts: Option<Starts>,
     /// Runs at a time; as many as there are cores if left out
-    #[arg(long)]
-    jobs: Option<NonZeroUsize>,
+    #[arg(long, value_parser = at_least_one, allow_negative_numbers = true)]
+    jobs: Option<usize>,
     /// Where to write everything [default: runs/PROFILE]
     #[arg(long)]
     out: Option<PathBuf>,
@@ -84,7 +87,8 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
         None => leave_out_what_a_task_lacks(registry, &mut plan)?,
     }
     plan.seeds = args.seeds.unwrap_or(plan.seeds);
-    let jobs = args.jobs.or_else(|| std::thread::available_parallelism().ok()).map_or(1, usize::from);
+    let cores = || std::thread::available_parallelism().map_or(1, usize::from);
+    let jobs = args.jobs.unwrap_or_else(cores);
     refuse_folder_of("run", "config.toml", &plan.folder)?;
     let mut runs = plan.runs(registry)?;
     for (config, folder) in &mut runs {
@@ -101,7 +105,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     let progress = Progress::new(&runs);
     runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
     progress.finish();
-    conclude(registry, &runs, &plan.folder)
+    conclude(registry, &runs, &plan.folder, &stop)
 }
 
 /// Of the methods that nobody asked for, those are left out that need something which one of the tasks does not have: a script, a
@@ -166,6 +170,10 @@ fn report_status(runs: &[RunStatus], jobs: usize) -> String {
     text + line(&format!("all, {jobs} at a time"), runs).trim_end()
 }
 
+fn at_least_one(text: &str) -> Result<usize, &'static str> {
+    whole(text).and_then(|number| if number == 0 { Err("give at least 1") } else { Ok(number) })
+}
+
 fn seed_range(text: &str) -> Result<Range<u64>, String> {
     let bad = |_| String::from("give a number of seeds, or a range like 0..5");
     match text.split_once("..") {
@@ -175,19 +183,36 @@ fn seed_range(text: &str) -> Result<Range<u64>, String> {
 }
 
 #[cfg(feature = "study")]
-fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path, stop: &AtomicBool) -> Result<()> {
     // A run may have been begun there since.
     refuse_folder_of("run", "config.toml", folder)?;
     let tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
     tables.write(folder)?;
-    for problem in crate::study::replays::record(registry, runs, folder)? {
-        super::output::note(format_args!("no replay: {problem}"));
+    let others = complete_runs(folder).into_iter().filter(|other| runs.iter().all(|(_, run)| run != other)).count();
+    if others > 0 {
+        note(format_args!(
+            "{}: {others} other complete run{} not asked for, so the tables are without; to include all, name all tasks, methods \
+             and seeds",
+            folder.display(),
+            if others == 1 { " is there that was" } else { "s are there that were" }
+        ));
+    }
+    for problem in crate::study::replays::record(registry, runs, folder, stop)? {
+        note(format_args!("no replay: {problem}"));
     }
     super::report::write(folder, folder)
 }
 
+/// The folders of complete runs in that of a study.
+#[cfg(feature = "study")]
+fn complete_runs(study: &Path) -> Vec<PathBuf> {
+    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let runs = inside(study.into()).flat_map(inside).flat_map(inside);
+    runs.filter(|run| RunConfig::read(&run.join("config.toml")).is_ok_and(|config| is_complete(run, &config))).collect()
+}
+
 #[cfg(not(feature = "study"))]
-fn conclude(_registry: &Registry, _runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<()> {
+fn conclude(_registry: &Registry, _runs: &[(RunConfig, PathBuf)], folder: &Path, _stop: &AtomicBool) -> Result<()> {
     let advice = "build with the feature `study` for tables and figures";
     super::output::answer(format_args!("the runs are in {}; {advice}", folder.display()))
 }

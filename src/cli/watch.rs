@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::output::answer;
-use super::whole;
+use super::{note_other_shake, whole};
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
@@ -11,9 +11,10 @@ use crate::study::starts::EvalSeeds;
 use crate::watch::Recording;
 
 #[derive(clap::Args)]
+#[command(group = clap::ArgGroup::new("agent").required(true).args(["run", "task"]))]
 pub(super) struct Args {
     /// A run's folder
-    #[arg(long, required_unless_present = "task", conflicts_with = "task")]
+    #[arg(long)]
     run: Option<PathBuf>,
     /// A task, for a policy that needs no training
     #[arg(long)]
@@ -24,7 +25,7 @@ pub(super) struct Args {
     /// The seed of the initial state: the first that `evaluate --seed` meets with it
     #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
-    /// The file [default: NAME.html]
+    /// The file [default: watch.html in the run's folder, or TASK-POLICY.html]
     #[arg(long)]
     out: Option<PathBuf>,
 }
@@ -52,6 +53,7 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let (config, mut method, default) = match (&args.run, &args.task) {
         (Some(folder), _) => {
             let (config, method) = registry.trained_method(folder)?;
+            note_other_shake(&config);
             (config, method, folder.join("watch.html"))
         }
         (None, Some(task)) => {

@@ -135,6 +135,11 @@ impl RunConfig {
         if let Some(problem) = reserved(&agent) {
             return Err(serde::de::Error::custom(problem));
         }
+        if let Some(other) = OUR_AGENTS.iter().find(|other| **other != agent && table.contains_key(**other)) {
+            return Err(serde::de::Error::custom(format!(
+                "[{other}] is for another kind of agent; settings of this one stand in [{agent}]"
+            )));
+        }
         let settings = match table.remove(&agent) {
             Some(settings) => settings.try_into()?,
             None => Table::new(),

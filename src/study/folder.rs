@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::LazyLock;
 use std::time::Duration;
 
@@ -12,7 +11,8 @@ use serde::{Deserialize, Serialize};
 use super::config::{RunConfig, bad_config};
 use super::evaluate::Summary;
 use super::records::{Progress, TABLES, write_test};
-use super::tensorboard;
+use super::version::SOURCE;
+use super::{tensorboard, version};
 use crate::agent::Method;
 use crate::checkpoint::Weights;
 use crate::error::{Error, Result};
@@ -26,24 +26,6 @@ const LOCK: &str = ".lock";
 
 /// The note in a checkpoint, and in weights, that holds the run's configuration.
 const RUN: &str = "run";
-
-/// What stands between the versions that have worked on a run, where there is more than one.
-pub(super) const BETWEEN_VERSIONS: &str = ", ";
-
-/// The version of this program, with the commit of its sources if they are in a repository of their own: what `git describe` says
-/// of them when the first run begins.
-pub(super) static SOURCE: LazyLock<String> = LazyLock::new(|| {
-    let sources = env!("CARGO_MANIFEST_DIR");
-    let git = |arguments: &[&str]| -> Option<String> {
-        let said = Command::new("git").arg("-C").arg(sources).args(arguments).output().ok()?;
-        let text = String::from_utf8(said.stdout).ok()?;
-        said.status.success().then(|| text.trim().to_string())
-    };
-    let own = git(&["rev-parse", "--show-toplevel"]).is_some_and(|top| Path::new(&top) == Path::new(sources));
-    let commit = own.then(|| git(&["describe", "--always", "--dirty", "--abbrev=10"])).flatten();
-    let version = env!("CARGO_PKG_VERSION");
-    commit.map_or(version.into(), |commit| format!("{version} ({commit})"))
-});
 
 /// The folder of a run that is open. It is locked: no other process, and no other [`RunFolder`] in this one, writes there.
 pub(super) struct RunFolder {
@@ -143,8 +125,7 @@ impl RunFolder {
         let checksums = checksums.collect::<Result<_>>()?;
         // What is lost of a complete run may be written anew by a later version, which has not made it.
         let made_by = Completed::read(&self.path).ok().map(|run| run.version).filter(|version| !version.is_empty());
-        let all = || progress.versions.iter().map(String::as_str).collect::<Vec<_>>().join(BETWEEN_VERSIONS);
-        let version = made_by.unwrap_or_else(all);
+        let version = made_by.unwrap_or_else(|| version::joined(&progress.versions));
         let completed = Completed { version, summary: test.summary(), checksums };
         let completed = toml::to_string(&completed).expect("a summary is TOML");
         files::write(&self.path.join(SUMMARY), completed.as_bytes())
@@ -259,7 +240,13 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
         let advice = "the run has saved no weights yet; let it train for longer";
         return Err(Error::Config(format!("{}: {advice}", folder.display())));
     }
-    let weights = read_own(&path, config)?;
+    let weights = read_own(&path, config).map_err(|problem| match problem {
+        // Checkpoints hold the weights, too.
+        Error::Checkpoint { .. } if Weights::read(&path).is_err() && folder.join(CHECKPOINT).is_file() => {
+            Error::checkpoint(&path, "damaged; the command that made the run writes it anew", Some(problem.into()))
+        }
+        problem => problem,
+    })?;
     check_saved(&weights, &path)?;
     let loaded = method.checkpoint_mut().load_weights(&weights);
     loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))

@@ -59,3 +59,4 @@ pub mod tables;
 mod tensorboard;
 #[cfg(feature = "study")]
 mod verdict;
+mod version;

@@ -3,9 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
-use super::folder::BETWEEN_VERSIONS;
 use super::starts::Starts;
 use super::tables::{Run, Tables};
+use super::version::is_one_commit;
 use crate::error::{Result, shortened};
 use crate::watch::escaped;
 
@@ -78,11 +78,7 @@ fn left_out(tables: &Tables) -> Result<Vec<String>> {
 /// Why it cannot be said that one version, with its sources committed, made all runs; nothing if it can.
 fn versions(runs: &[Run]) -> Vec<String> {
     let versions: BTreeSet<&str> = runs.iter().map(|run| run.version.as_str()).collect();
-    // A run that several versions have worked on names them all.
-    let known = versions
-        .iter()
-        .all(|version| version.contains('(') && !version.contains("dirty") && !version.contains(BETWEEN_VERSIONS));
-    if versions.len() == 1 && known {
+    if versions.len() == 1 && versions.iter().all(|version| is_one_commit(version)) {
         return Vec::new();
     }
     let shown = |version: &&str| if version.is_empty() { "one that is not recorded".into() } else { quoted(version) };

@@ -3,6 +3,7 @@
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use flate2::read::GzDecoder;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
@@ -95,11 +96,16 @@ impl Replay {
 }
 
 /// Records the episodes of a study's complete runs into `folder`, several at a time. What is recorded already, with the same return, stays.
-/// Returns what could not be recorded, each with the reason.
+/// Returns what could not be recorded, each with the reason. If `stop` becomes true, no further recording is begun.
 ///
 /// # Errors
-/// If a file cannot be written.
-pub fn record(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path) -> Result<Vec<String>> {
+/// If a file cannot be written; [`Error::Interrupted`] if it was stopped.
+pub fn record(
+    registry: &Registry,
+    runs: &[(RunConfig, PathBuf)],
+    folder: &Path,
+    stop: &AtomicBool,
+) -> Result<Vec<String>> {
     // A table that cannot be read is written anew.
     let recorded = read(folder).unwrap_or_default();
     let episodes: Vec<(Replay, &Path)> = chosen(runs);
@@ -107,6 +113,9 @@ pub fn record(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path)
         .into_par_iter()
         .map(|(replay, run)| {
             if !recorded.contains(&replay) || replay.recorded(folder).is_err() {
+                if stop.load(Ordering::Relaxed) {
+                    return Err(Error::Interrupted);
+                }
                 files::write(&folder.join(&replay.file), &recording(registry, &replay, run)?)?;
             }
             Ok(replay)
@@ -116,7 +125,7 @@ pub fn record(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path)
     for outcome in outcomes {
         match outcome {
             Ok(replay) => rows.push(replay),
-            Err(problem @ Error::Io { .. }) => return Err(problem),
+            Err(problem @ (Error::Io { .. } | Error::Interrupted)) => return Err(problem),
             Err(problem) => problems.push(problem.to_string()),
         }
     }

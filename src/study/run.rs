@@ -26,12 +26,13 @@ use std::time::{Duration, Instant};
 
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Evaluator};
+use super::folder::RunFolder;
 #[cfg(feature = "cli")]
 pub(crate) use super::folder::check_run;
-use super::folder::{RunFolder, SOURCE};
 pub use super::folder::{is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
+use super::version::SOURCE;
 use crate::agent::{Method, Mode};
 use crate::checkpoint::Weights;
 use crate::env::Env;

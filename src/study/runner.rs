@@ -198,10 +198,16 @@ pub fn carry_out_all(
     std::thread::scope(|scope| {
         for _ in 0..jobs {
             scope.spawn(|| {
-                let pool = rayon::ThreadPoolBuilder::new()
-                    .num_threads((cores / jobs).max(1))
-                    .build()
-                    .expect("threads for a run");
+                let fail = |error: Error| {
+                    // First the reason, then the signal: the others will answer that they were interrupted.
+                    failure.lock().expect("no panic holds it").get_or_insert(error);
+                    stop.store(true, Ordering::Relaxed);
+                };
+                let pool = rayon::ThreadPoolBuilder::new().num_threads((cores / jobs).max(1)).build();
+                let pool = match pool {
+                    Ok(pool) => pool,
+                    Err(problem) => return fail(Error::Config(format!("cannot start threads for a run: {problem}"))),
+                };
                 loop {
                     let index = next.fetch_add(1, Ordering::Relaxed);
                     let Some((config, folder)) = runs.get(index) else { break };
@@ -209,10 +215,7 @@ pub fn carry_out_all(
                         continue;
                     }
                     if let Err(error) = pool.install(|| carry_out(registry, index, config, folder, observer, stop)) {
-                        // First the reason, then the signal: the others will answer that they were interrupted.
-                        failure.lock().expect("no panic holds it").get_or_insert(error);
-                        stop.store(true, Ordering::Relaxed);
-                        return;
+                        return fail(error);
                     }
                 }
             });

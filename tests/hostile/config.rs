@@ -302,7 +302,7 @@ fn nothing_is_ignored() {
         ("pets", "agent = 'sac'", "`agent` cannot be changed, it is \"pets\"; choose another method by --method"),
         ("random", "steps = 100", "`steps` is 100, but random does not learn; leave it out"),
         ("pets", "base = 'sac'", "unknown field `base`"),
-        ("pets", "[sac]\nbatch = 3", "unknown field `sac`"),
+        ("pets", "[sac]\nbatch = 3", "[sac] is for another kind of agent; settings of this one stand in [pets]"),
         ("pets", "pets.ensemble.batch = -1", "`pets.ensemble.batch`: invalid value: integer `-1`"),
         ("pets", "[pets.ensemble]\nbatchh = 3", "`pets.ensemble`: unknown field `batchh` (did you mean `batch`?)"),
     ] {

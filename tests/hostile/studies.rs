@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 use handful::study::tables::Tables;
 use handful::study::{replays, report};
@@ -25,7 +26,9 @@ fn study(runs: &[&str], starts: &str) -> TempDir {
             evaluations += &format!("{run},{step},20,0.5\n");
         }
         let seed = run.rsplit(',').next().expect("a seed");
-        let settings = format!("seed = {seed}\nsteps = {steps}\ntest_episodes = 3\nstarts = \"\"{starts}\"\"\n");
+        let settings = format!(
+            "seed = {seed}\nsteps = {steps}\nevaluate_every = 500\ntest_episodes = 3\nstarts = \"\"{starts}\"\"\n"
+        );
         configurations += &format!("{run},1,\"{settings}\"\n");
     }
     for (file, text) in [
@@ -65,9 +68,11 @@ fn a_run_that_is_not_whole_is_left_out_by_name() {
     let tables = Tables::read(whole.path()).expect("a study");
     assert!(runs(&tables) == ALL && tables.missing_runs().expect("a table").is_empty());
     let last_line_less = |text: String| text.trim_end().rsplit_once('\n').expect("several lines").0.to_string() + "\n";
+    let middle_less = |text: String| text.replace("pole,debug,1,500,20,0.5\n", "");
     let other = |text: String| text.replace("seed = 1\n", "seed = 1\nreward = 2\n");
     for (file, change, reason) in [
         ("evaluations.csv", &last_line_less as &dyn Fn(String) -> String, "is at step 500 of 1000"),
+        ("evaluations.csv", &middle_less, "its evaluation at step 500 is not in"),
         ("tests.csv", &last_line_less, "its test in `tests.csv` has 2 of 3 episodes"),
         ("runs.csv", &other, "it has another configuration than with seed 0 (its `reward` is 2, not nothing)"),
     ] {
@@ -206,11 +211,13 @@ fn another_recording_of_the_same_name_is_recorded_anew() {
     let config = registry.config("pendulum", "random", 0, None, None).expect("a preset");
     let config = RunConfig { test_episodes: 3, ..config };
     let others = [RunConfig { seed: 1, ..config.clone() }, RunConfig { starts: Starts::Development, ..config.clone() }];
+    let never = AtomicBool::new(false);
     let recorded = |name: &str, config: &RunConfig| -> PathBuf {
         let (run, folder) = (root.path().join(name).join("run"), root.path().join(name));
         let mut open = registry.open_run(config, &run).expect("a run");
         while !matches!(open.step().expect("a healthy run"), Event::Tested(_)) {}
-        let problems = replays::record(&registry, &[(config.clone(), run)], &folder).expect("a writable folder");
+        let problems =
+            replays::record(&registry, &[(config.clone(), run)], &folder, &never).expect("a writable folder");
         assert!(problems.is_empty(), "{problems:?}");
         folder.join("replays/pendulum-random-median.json.gz")
     };
@@ -225,10 +232,15 @@ fn another_recording_of_the_same_name_is_recorded_anew() {
             assert!(fs::read(&ours).expect("a recording") == before, "{name}");
         }
     }
+    // None is begun once it is to stop.
+    fs::remove_file(&ours).expect("a writable folder");
+    let run = (config.clone(), root.path().join("ours/run"));
+    let stopped = replays::record(&registry, &[run], &root.path().join("ours"), &AtomicBool::new(true));
+    assert!(matches!(stopped, Err(Error::Interrupted)) && !ours.exists());
 
     fn recorded_again(registry: &Registry, config: &RunConfig, root: &Path) {
         let run = (config.clone(), root.join("ours/run"));
-        replays::record(registry, &[run], &root.join("ours")).expect("a writable folder");
+        replays::record(registry, &[run], &root.join("ours"), &AtomicBool::new(false)).expect("a writable folder");
     }
 }
 

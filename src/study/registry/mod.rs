@@ -179,10 +179,13 @@ impl Registry {
         }
         let path = file.unwrap_or(Path::new(method));
         let mut config = RunConfig::from_table(table).map_err(|problem| bad_config(path, &problem))?;
-        self.complete(&mut config, path).map_err(|problem| match (problem, file) {
-            (Error::Config(problem), Some(file)) => Error::Config(format!("{}: {problem}", file.display())),
-            (problem, _) => problem,
+        self.complete(&mut config, path).map_err(|problem| match file {
+            Some(file) => in_file(file, problem),
+            None => problem,
         })?;
+        if config.steps == 0 && self.agent_entry(&config.agent)?.learns {
+            return Err(Error::Config(format!("`steps` is 0, but {} learns; give at least 1", config.method)));
+        }
         Ok(config)
     }
 
@@ -297,7 +300,7 @@ impl Registry {
             let mut table = config.to_table();
             self.change(&mut table, file, &config.task, &self.choices(&config.task)?)?;
             config = RunConfig::from_table(table).map_err(|problem| bad_config(file, &problem))?;
-            self.complete(&mut config, file)?;
+            self.complete(&mut config, file).map_err(|problem| in_file(file, problem))?;
         }
         let mut method = self.method(&config)?;
         // Not `config.learns()`: a file may say that it has no steps.
@@ -322,6 +325,14 @@ impl Registry {
     fn agent_entry(&self, name: &str) -> Result<&AgentEntry> {
         let found = self.agents.iter().find(|entry| entry.name == name);
         found.ok_or_else(|| Error::unknown("agent", name, self.agents.iter().map(|entry| entry.name.as_str())))
+    }
+}
+
+/// A problem with settings, with the file that they come from.
+fn in_file(file: &Path, problem: Error) -> Error {
+    match problem {
+        Error::Config(problem) => Error::Config(format!("{}: {problem}", file.display())),
+        problem => problem,
     }
 }
 

@@ -19,27 +19,40 @@ impl Tables {
     }
 }
 
-/// The same before a study of these runs. The tables of runs that are in the folder themselves can be made again, and a table that cannot
-/// be read is made anew.
+/// The same before a study of these runs. The tables of runs that are in the folder themselves can be made again.
 ///
 /// # Errors
-/// If the folder holds the tables of a study with a run that is neither one of these nor in the folder.
+/// If the folder holds the tables of a study with a run that is neither one of these nor in the folder; or if there are only damaged
+/// tables, and no run.
 #[cfg(feature = "cli")]
 pub(crate) fn check_place(folder: &Path, runs: &[(RunConfig, PathBuf)]) -> Result<()> {
     let ours = |(task, method, seed): &RunName| {
         runs.iter().any(|(run, _)| run.task == *task && run.method == *method && run.seed == *seed)
     };
     let there = |(task, method, seed): &RunName| run_folder(folder, task, method, *seed).is_dir();
-    check(folder, &runs_in(folder).unwrap_or_default(), |run| ours(run) || there(run))
+    // One of the tables may be lost or damaged.
+    let formats = [("tests.csv", &read::TESTS), ("runs.csv", &read::RUNS), ("evaluations.csv", &read::EVALUATIONS)];
+    let tables: Vec<Result<Vec<RunName>>> =
+        formats.map(|(file, format)| runs_in_table(&folder.join(file), format)).into();
+    let (known, problems): (Vec<_>, Vec<_>) = tables.into_iter().partition(|table| table.is_ok());
+    let known: Vec<RunName> = known.into_iter().flatten().flatten().collect();
+    let problem = problems.into_iter().find_map(Result::err);
+    match problem {
+        Some(problem) if known.is_empty() && !runs.iter().any(|(_, run)| run.is_dir()) => Err(problem),
+        _ => check(folder, &known, |run| ours(run) || there(run)),
+    }
 }
 
 /// The runs in the tables of a folder.
 fn runs_in(folder: &Path) -> Result<Vec<RunName>> {
-    let path = folder.join("tests.csv");
+    runs_in_table(&folder.join("tests.csv"), &read::TESTS)
+}
+
+fn runs_in_table(path: &Path, format: &read::TableFormat) -> Result<Vec<RunName>> {
     if !path.exists() {
         return Ok(Vec::new());
     }
-    run_names(&read::of_study(&path, &read::TESTS)?).map_err(inside)
+    run_names(&read::of_study(path, format)?).map_err(inside)
 }
 
 fn check(folder: &Path, theirs: &[RunName], is_safe: impl Fn(&RunName) -> bool) -> Result<()> {

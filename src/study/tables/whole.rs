@@ -44,8 +44,8 @@ impl Tables {
         let mut settings = settings(&recorded)?;
         let names = run_names(&self.runs).map_err(inside)?;
         let names: BTreeSet<RunName> = names.into_iter().collect();
-        let steps = last_of_each(&self.evaluations, "step").map_err(inside)?;
-        let episodes = last_of_each(&self.tests, "episode").map_err(inside)?;
+        let steps = numbers_of_each(&self.evaluations, "step").map_err(inside)?;
+        let episodes = numbers_of_each(&self.tests, "episode").map_err(inside)?;
         let (mut admission, mut objections) = (Admission::default(), Vec::new());
         for name in run_names(&self.tests).map_err(inside)? {
             if !names.contains(&name) {
@@ -56,7 +56,7 @@ impl Tables {
             if run.number("steps").is_some_and(|steps| steps > 0) && !steps.contains_key(&name) {
                 return Err(incomplete(&name, "evaluations.csv"));
             }
-            let lost = lost_rows(&run, steps.get(&name).copied(), episodes.get(&name).copied());
+            let lost = lost_rows(&run, steps.get(&name), episodes.get(&name));
             match lost.or_else(|| admission.objection(&run).map(|objection| format!("it {objection}"))) {
                 Some(reason) => objections.push((name, reason)),
                 None => admission.admit(&run),
@@ -66,23 +66,34 @@ impl Tables {
     }
 }
 
-/// What the tables lack of a run, of which they have an evaluation at `step` as the last, and `episodes` of the test.
-fn lost_rows(run: &Candidate, step: Option<i64>, episodes: Option<i64>) -> Option<String> {
-    let differs = |wanted: Option<i64>, there: Option<i64>| wanted.zip(there).filter(|(wanted, there)| wanted != there);
-    if let Some((steps, step)) = differs(run.number("steps").filter(|steps| *steps > 0), step) {
-        return Some(format!("its last evaluation in `evaluations.csv` is at step {step} of {steps}"));
+/// What the tables lack of a run that has evaluations at these steps and these episodes of the test.
+fn lost_rows(run: &Candidate, steps: Option<&Vec<i64>>, episodes: Option<&Vec<i64>>) -> Option<String> {
+    if let (Some(budget), Some(there)) = (run.number("steps").filter(|budget| *budget > 0), steps) {
+        if let Some(last) = there.last().filter(|last| **last != budget) {
+            return Some(format!("its last evaluation in `evaluations.csv` is at step {last} of {budget}"));
+        }
+        let every =
+            run.number("evaluate_every").and_then(|every| usize::try_from(every).ok()).filter(|every| *every > 0);
+        let lost = every.and_then(|every| (0..budget).step_by(every).find(|step| !there.contains(step)));
+        if let Some(step) = lost {
+            return Some(format!("its evaluation at step {step} is not in `evaluations.csv`"));
+        }
     }
-    let (wanted, there) = differs(run.number("test_episodes"), episodes)?;
-    Some(format!("its test in `tests.csv` has {there} of {wanted} episodes"))
+    let (wanted, there) = (run.number("test_episodes")?, episodes?.len());
+    (usize::try_from(wanted) != Ok(there)).then(|| format!("its test in `tests.csv` has {there} of {wanted} episodes"))
 }
 
-/// A column's number in the last row of each run.
-fn last_of_each(table: &DataFrame, column: &str) -> PolarsResult<BTreeMap<RunName, i64>> {
-    if table.width() == 0 {
-        return Ok(BTreeMap::new());
+/// The numbers in a column, for each run.
+fn numbers_of_each(table: &DataFrame, column: &str) -> PolarsResult<BTreeMap<RunName, Vec<i64>>> {
+    let mut of_each: BTreeMap<RunName, Vec<i64>> = BTreeMap::new();
+    if table.width() > 0 {
+        let numbers = numbers(table, column)?.into_iter().map(|number| number.unwrap_or_default() as i64);
+        row_names(table)?
+            .into_iter()
+            .zip(numbers)
+            .for_each(|(name, number)| of_each.entry(name).or_default().push(number));
     }
-    let numbers = numbers(table, column)?.into_iter().map(|number| number.unwrap_or_default() as i64);
-    Ok(row_names(table)?.into_iter().zip(numbers).collect())
+    Ok(of_each)
 }
 
 /// The rows of the other runs.
