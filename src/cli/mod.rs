@@ -10,6 +10,7 @@ mod study;
 mod train;
 mod watch;
 
+use std::error::Error as _;
 use std::path::Path;
 use std::process::ExitCode;
 use std::str::FromStr;
@@ -93,8 +94,13 @@ pub fn main(registry: &Registry) -> ExitCode {
 
 /// The threads that all commands share.
 fn begin_threads() -> Result<()> {
-    let threads = rayon::ThreadPoolBuilder::new().build_global();
-    threads.map_err(|problem| Error::Config(format!("cannot start threads ({problem}); lower RAYON_NUM_THREADS")))
+    match rayon::ThreadPoolBuilder::new().build_global() {
+        // Without a cause, a program of one's own has begun them already.
+        Err(problem) if problem.source().is_some() => {
+            Err(Error::Config(format!("cannot start threads ({problem}); lower RAYON_NUM_THREADS")))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// A number on the command line.

@@ -25,11 +25,11 @@ pub(super) struct Args {
     /// Size of the study
     #[arg(long, value_enum, default_value_t = ProfileArg::Quick)]
     profile: ProfileArg,
-    /// Tasks, separated by commas; each then has the full budget of its presets, also in the quick profile [default: reach; in
-    /// the full profile reach,push,lift]
+    /// Tasks, separated by commas; each then has the full budget of its presets, also in the quick profile [default: those
+    /// of the profile]
     #[arg(long, value_delimiter = ',')]
     tasks: Option<Vec<String>>,
-    /// Methods, separated by commas [default: all with a preset that are compared, see the README]
+    /// Methods, separated by commas [default: those of the profile]
     #[arg(long, value_delimiter = ',')]
     methods: Option<Vec<String>>,
     /// How many seeds, or a range like 0..5 [default: 2, in the full profile 5]
