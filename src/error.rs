@@ -45,8 +45,26 @@ pub enum Error {
     Contract {
         /// The environment.
         env: String,
-        /// The rule that was broken, and at which step of the episode.
+        /// The rule that was broken, at which step of which episode.
         rule: String,
+    },
+    /// An environment that failed, for instance because a simulator or a device behind it did.
+    #[error("{env}: {problem}")]
+    Environment {
+        /// The environment.
+        env: String,
+        /// What went wrong.
+        problem: String,
+        /// What caused it.
+        source: Option<Cause>,
+    },
+    /// A run of a study that failed, while the others went on.
+    #[error("{}: {source}", .folder.display())]
+    Run {
+        /// The run's folder.
+        folder: PathBuf,
+        /// Why.
+        source: Box<Error>,
     },
     /// A setting with an unusable value, or settings that do not fit together.
     #[error("{0}")]
@@ -123,6 +141,12 @@ impl Error {
     /// An action that does not fit.
     pub fn action(env: &str, problem: impl Into<String>) -> Self {
         Self::Action { env: env.into(), problem: problem.into() }
+    }
+
+    /// An environment that failed, for the cause that another library tells.
+    pub fn environment(env: &str, cause: impl Into<Cause>) -> Self {
+        let cause = cause.into();
+        Self::Environment { env: env.into(), problem: cause.to_string(), source: Some(cause) }
     }
 
     /// A checkpoint that cannot be used.

@@ -274,6 +274,13 @@ fn train_evaluate_and_watch() {
     let here = folder.path();
     let output = handful(here, &["train", "--task", "push", "--method", "debug", "--steps", "300", "--out", "run"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
+    assert!(!text(&output.stderr).contains("learns nothing"), "{}", text(&output.stderr));
+    let output = handful(here, &["train", "--task", "pendulum", "--method", "debug", "--steps", "1", "--out", "short"]);
+    assert!(
+        text(&output.stderr).contains("debug on pendulum learns nothing: `sac.warm_up` is"),
+        "{}",
+        text(&output.stderr)
+    );
     let output = handful(here, &["evaluate", "--run", "run", "--episodes", "3", "--seed", "1", "--json"]);
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(summary["episodes"], 3);

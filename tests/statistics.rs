@@ -331,6 +331,42 @@ fn a_report_says_where_methods_do_not_have_the_same_environment() {
     assert!(differ.contains("**Not the same environment:**") && differ.contains(expected), "{differ}");
 }
 
+/// A success rate of zero for everyone says nothing about which method is better.
+#[test]
+fn where_nothing_succeeds_returns_are_compared() {
+    let folder = study_by_hand(&[("pets", &[0; 4], 0, [500, 1000]), ("sac", &[0; 4], 0, [500, 1000])]);
+    let rewrite = |table: &str, change: &dyn Fn(&[&str]) -> String| {
+        let path = folder.path().join(table);
+        let text = std::fs::read_to_string(&path).expect("a table");
+        let rows = text.lines().map(|line| change(&line.split(',').collect::<Vec<_>>()) + "\n");
+        std::fs::write(&path, rows.collect::<String>()).expect("a writable folder");
+    };
+    rewrite("evaluations.csv", &|row| row.join(",") + if row[0] == "task" { ",return_mean" } else { ",-15.0" });
+    // Seed 0 of `pets` has -10, seed 1 -11, and so on; those of `sac` have -20, -21.
+    rewrite("tests.csv", &|row| match row[2].parse::<f64>() {
+        Ok(seed) => {
+            let total = if row[1] == "pets" { -10.0 } else { -20.0 } - seed;
+            [&row[..4], &[&total.to_string()], &row[5..]].concat().join(",")
+        }
+        Err(_) => row.join(","),
+    });
+    handful::study::report::write(folder.path(), folder.path()).expect("a study");
+    let tables = handful::study::tables::Tables::read(folder.path()).expect("a study");
+    let value = |column: &str| tables.value("pole", "pets", column).expect("a column").expect("a number");
+    assert_eq!(value("return_minus_sac"), 10.0);
+    // Student's t with 3 degrees of freedom, a variance of 5/3 and four seeds each.
+    near("low", value("return_minus_sac_t_low"), 10.0 - 3.182_446 * (5.0_f64 / 6.0).sqrt(), 1e-4);
+    near("high", value("return_t_high"), -11.5 + 3.182_446 * (5.0_f64 / 12.0).sqrt(), 1e-4);
+    let report = report_in(folder.path());
+    for part in [
+        "Significantly higher test returns than `sac`: `pets`.",
+        "`pets` has a mean test return of -11.5 [-13.6, -9.4]. From the same test starts, minus that of `sac`: +10.0 [",
+    ] {
+        assert!(report.contains(part), "no `{part}` in: {report}");
+    }
+    assert!(!report.contains("No significant difference in test success"), "{report}");
+}
+
 /// `dreamer` with five seeds, one of which fails, `pets` with two, `sac` with one.
 #[test]
 fn a_summary_says_what_its_seeds_can_tell() {

@@ -59,7 +59,7 @@ pub(super) struct Decision {
 /// A decision that is over.
 #[derive(Debug)]
 pub(super) enum Over {
-    /// It lasted as long as it should, or until the task itself ended. The reward is the mean.
+    /// It lasted as long as it should, or until the task itself ended. The reward is the mean, with zeros after the end of the task.
     Whole(Transition),
     /// The time limit cut it short: what follows from holding its action is unknown. The observation that it began with.
     Short(Vec<f32>),
@@ -79,8 +79,11 @@ impl Decision {
                 Transition { obs, action, reward, ..t.clone() }
             }
         };
-        if self.steps >= steps || t.terminated {
+        if self.steps >= steps {
             Some(Over::Whole(joined))
+        } else if t.terminated {
+            let reward = joined.reward * self.steps as f32 / steps as f32;
+            Some(Over::Whole(Transition { reward, ..joined }))
         } else if t.truncated {
             Some(Over::Short(joined.obs))
         } else {
@@ -99,7 +102,7 @@ impl Decision {
 pub(super) fn in_decisions(episode: &Episode, steps: usize) -> Episode {
     let count = episode.rewards.len();
     let whole = if episode.terminated { count.div_ceil(steps) } else { count / steps };
-    let mean = |rewards: &[f32]| rewards.iter().sum::<f32>() / rewards.len() as f32;
+    let mean = |rewards: &[f32]| rewards.iter().sum::<f32>() / steps as f32;
     Episode {
         observations: (0..=whole).map(|i| episode.observations[(i * steps).min(count)].clone()).collect(),
         actions: episode.actions.iter().step_by(steps).take(whole).cloned().collect(),
@@ -155,13 +158,13 @@ mod tests {
                 Over::Whole(t) => vec![t.obs[0], t.action[0], t.reward, t.next_obs[0]],
                 Over::Short(obs) => obs.clone(),
             });
-            let last = if terminated { vec![6.0, 6.0, 6.0, 7.0] } else { vec![6.0] };
+            let last = if terminated { vec![6.0, 6.0, 2.0, 7.0] } else { vec![6.0] };
             assert_eq!(found.collect::<Vec<_>>(), [vec![0.0, 0.0, 1.0, 3.0], vec![3.0, 3.0, 4.0, 6.0], last]);
             let coarse = in_decisions(&recorded, 3);
             let count = if terminated { 3 } else { 2 };
             assert_eq!(coarse.observations.concat(), [0.0, 3.0, 6.0, 7.0][..=count]);
             assert_eq!(coarse.actions.concat(), [0.0, 3.0, 6.0][..count]);
-            assert_eq!(coarse.rewards, [1.0, 4.0, 6.0][..count]);
+            assert_eq!(coarse.rewards, [1.0, 4.0, 2.0][..count]);
         }
     }
 }

@@ -113,8 +113,20 @@ pub(crate) fn preset_table(
         tables.push(table);
     }
     let mut whole = Table::new();
-    tables.into_iter().rev().for_each(|table| merge(&mut whole, table, choices));
+    for table in tables.into_iter().rev() {
+        rename_settings(&mut whole, table.get("agent"));
+        merge(&mut whole, table, choices);
+    }
     Ok(whole)
+}
+
+/// An agent that replaces that of the `base` has its settings: a variant reads them in a table of its own name.
+fn rename_settings(base: &mut Table, agent: Option<&Value>) {
+    let name = |agent: Option<&Value>| agent.and_then(Value::as_str).map(String::from);
+    let (Some(agent), Some(replaced)) = (name(agent), name(base.get("agent"))) else { return };
+    if let Some(settings) = base.remove(&replaced) {
+        base.insert(agent, settings);
+    }
 }
 
 /// Puts the part of a table that is for this task over the rest of it.

@@ -120,6 +120,19 @@ fn refuse_folder_of(what: &str, file: &str, folder: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Says so if a run ends before its agent begins to learn.
+fn note_long_warm_up(config: &RunConfig) {
+    let warm_up = config.settings.get("warm_up").and_then(toml::Value::as_integer);
+    if let Some(warm_up) =
+        warm_up.filter(|warm_up| usize::try_from(*warm_up).is_ok_and(|warm_up| warm_up >= config.steps))
+    {
+        let RunConfig { task, method, agent, steps, .. } = config;
+        note(format_args!(
+            "{method} on {task} learns nothing: `{agent}.warm_up` is {warm_up}, and the run has {steps} steps"
+        ));
+    }
+}
+
 /// For commands that have nothing to save: Ctrl-C, SIGTERM and SIGHUP end the program.
 fn end_on_ctrl_c() -> Result<()> {
     handle_ctrl_c(|| std::process::exit(130))

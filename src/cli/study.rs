@@ -9,13 +9,13 @@ use indicatif::HumanDuration;
 
 use super::output::{answer, note};
 use super::progress::Progress;
-use super::{refuse_folder_of, stop_on_ctrl_c, whole};
+use super::{note_long_warm_up, refuse_folder_of, stop_on_ctrl_c, whole};
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
 use crate::study::run::check_run;
 #[cfg(feature = "study")]
-use crate::study::run::is_complete;
+use crate::study::runner::other_complete_runs;
 use crate::study::runner::{self, Profile, StudyPlan};
 use crate::study::starts::Starts;
 use crate::study::status::{RunState, RunStatus, status, time_left};
@@ -101,11 +101,18 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
     }
     #[cfg(feature = "study")]
     crate::study::tables::check_place(&plan.folder, &runs)?;
+    let mut first_of_method: Vec<&RunConfig> = runs.iter().map(|(config, _)| config).collect();
+    first_of_method.dedup_by_key(|config| (&config.task, &config.method));
+    first_of_method.into_iter().for_each(note_long_warm_up);
     let stop = stop_on_ctrl_c()?;
     let progress = Progress::new(&runs);
-    runner::carry_out_all(registry, &runs, jobs, &progress, &stop)?;
+    let failed = match runner::carry_out_all(registry, &runs, jobs, &progress, &stop) {
+        Err(problem @ Error::Run { .. }) => Err(problem),
+        carried_out => Ok(carried_out?),
+    };
     progress.finish();
-    conclude(registry, &runs, &plan.folder, &stop)
+    let concluded = conclude(registry, &runs, &plan.folder, &stop);
+    failed.and(concluded)
 }
 
 /// Of the methods that nobody asked for, those are left out that need something which one of the tasks does not have: a script, a
@@ -188,7 +195,7 @@ fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path, s
     refuse_folder_of("run", "config.toml", folder)?;
     let tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
     tables.write(folder)?;
-    let others = complete_runs(folder).into_iter().filter(|other| runs.iter().all(|(_, run)| run != other)).count();
+    let others = other_complete_runs(folder, runs).len();
     if others > 0 {
         note(format_args!(
             "{}: {others} other complete run{} not asked for, so the tables are without; to include all, name all tasks, methods \
@@ -201,14 +208,6 @@ fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path, s
         note(format_args!("no replay: {problem}"));
     }
     super::report::write(folder, folder)
-}
-
-/// The folders of complete runs in that of a study.
-#[cfg(feature = "study")]
-fn complete_runs(study: &Path) -> Vec<PathBuf> {
-    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let runs = inside(study.into()).flat_map(inside).flat_map(inside);
-    runs.filter(|run| RunConfig::read(&run.join("config.toml")).is_ok_and(|config| is_complete(run, &config))).collect()
 }
 
 #[cfg(not(feature = "study"))]

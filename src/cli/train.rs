@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::output::answer;
 use super::progress::Progress;
-use super::{refuse_folder_of, stop_on_ctrl_c, whole};
+use super::{note_long_warm_up, refuse_folder_of, stop_on_ctrl_c, whole};
 use crate::error::Result;
 use crate::study::registry::Registry;
 use crate::study::run::{is_complete, read_summary};
@@ -47,6 +47,7 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
         answer(format_args!("this run is complete: {}", folder.display()))?;
         return print_test(&folder);
     }
+    note_long_warm_up(&config);
     let stop = stop_on_ctrl_c()?;
     let runs = vec![(config, folder)];
     let progress = Progress::new(&runs);

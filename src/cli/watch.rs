@@ -66,6 +66,10 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let title = format!("{}, {}, seed {}", config.task, config.method, args.seed);
     let reset_seed = EvalSeeds::Seed(args.seed).seed(0)?;
     let recording = Recording::of_episode(title, registry.make_env(&config)?, &mut method, reset_seed)?;
+    if !recording.is_visible() {
+        let advice = "draws nothing to watch: implement `Env::scene` and `Env::poses`";
+        return Err(Error::Unsupported(format!("`{}` {advice}", config.task)));
+    }
     let path = args.out.clone().unwrap_or(default);
     recording.write(&path)?;
     let outcome = if recording.success() { "success" } else { "no success" };

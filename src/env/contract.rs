@@ -6,6 +6,7 @@
 //! - the [`Spec`](super::Spec) makes sense ([`Spec::check`](super::Spec::check), asked at every reset);
 //! - observations have [`Spec::observation_size`](super::Spec::observation_size) numbers, all of them finite;
 //! - features are what their [`Role`] says: constant throughout an episode, or a difference of two others;
+//! - actions have [`Spec::action_size`](super::Spec::action_size) numbers, all of them finite;
 //! - rewards are finite;
 //! - the stage is at most the number of [`Spec::stages`](super::Spec::stages);
 //! - episodes end within [`Spec::horizon`](super::Spec::horizon) steps, terminated or truncated;
@@ -38,6 +39,8 @@ pub struct Checked<E> {
     env: E,
     /// Steps in this episode; None before the first reset and after the end of an episode.
     elapsed: Option<usize>,
+    /// The seed of the last reset.
+    seed: u64,
     /// The features whose values follow from their roles, by index; looked up at every reset.
     determined: Vec<(usize, Value)>,
 }
@@ -71,7 +74,7 @@ const TOLERANCE: f32 = 1e-3;
 impl<E: Env> Checked<E> {
     /// The environment, its contract enforced from the next reset on.
     pub fn new(env: E) -> Self {
-        Self { env, elapsed: None, determined: Vec::new() }
+        Self { env, elapsed: None, seed: 0, determined: Vec::new() }
     }
 
     /// The environment.
@@ -94,7 +97,7 @@ impl<E: Env> Checked<E> {
     /// # Errors
     /// [`Error::Config`] if the spec makes no sense, [`Error::Contract`] if the first observation breaks a rule.
     pub fn reset(&mut self, seed: u64) -> Result<Vec<f32>> {
-        self.elapsed = None;
+        (self.elapsed, self.seed) = (None, seed);
         self.env.spec().check()?;
         let obs = self.env.reset(seed);
         self.check_observation(&obs, "the reset")?;
@@ -107,12 +110,14 @@ impl<E: Env> Checked<E> {
     /// [`Env::step`]. Steps are counted from 1 in every episode.
     ///
     /// # Errors
-    /// Any error of [`Env::step`], after which the episode goes on; [`Error::Contract`] if a rule is broken, after which
-    /// only a reset helps.
+    /// [`Error::Action`] and any error of [`Env::step`], after which the episode goes on; [`Error::Contract`] if the environment
+    /// breaks a rule, after which only a reset helps.
     pub fn step(&mut self, action: &[f32]) -> Result<Step> {
         let Some(elapsed) = self.elapsed else {
-            return self.broken("a step before the first reset, or after the end of an episode; reset first".into());
+            let rule = "a step before the first reset, or after the end of an episode; reset first".into();
+            return Err(Error::Contract { env: self.env.spec().name.clone(), rule });
         };
+        self.env.spec().check_action(action)?;
         let step = self.env.step(action)?;
         self.elapsed = None;
         let (count, spec) = (elapsed + 1, self.env.spec());
@@ -185,6 +190,7 @@ impl<E: Env> Checked<E> {
     }
 
     fn broken<T>(&self, rule: String) -> Result<T> {
+        let rule = format!("{rule} (in the episode of `reset({})`)", self.seed);
         Err(Error::Contract { env: self.env.spec().name.clone(), rule })
     }
 }

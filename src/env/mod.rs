@@ -126,6 +126,7 @@ pub trait Env: std::any::Any + Send {
     ///
     /// # Errors
     /// [`crate::error::Error::Action`] if the action has the wrong length or is not finite; nothing has moved then.
+    /// [`crate::error::Error::Environment`] if the environment itself fails, also for a reset that failed before.
     fn step(&mut self, action: &[f32]) -> Result<Step>;
 
     /// Position (m) of the tracked point, a robot's hand for example; the smoothness of motion is measured there. None
@@ -222,7 +223,8 @@ pub trait KnownReward {
     /// The reward of reaching `next_obs` from `obs` by `action`. It is also asked of environments that were never reset.
     fn reward(&self, obs: &[f32], action: &[f32], next_obs: &[f32]) -> f32;
 
-    /// Whether reaching `next_obs` terminates the episode. False by default: most tasks here end by truncation alone.
+    /// Whether reaching `next_obs` terminates the episode. False by default: most tasks here end by truncation alone. If the task
+    /// can end earlier, say when, or plans go on beyond the end.
     fn terminated(&self, _next_obs: &[f32]) -> bool {
         false
     }

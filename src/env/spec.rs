@@ -28,7 +28,7 @@ pub struct Spec {
     pub name: String,
     /// One feature for each number of an observation, in order.
     pub observation: Vec<Feature>,
-    /// Dimension of an action; each component lies in [-1, 1].
+    /// Dimension of an action; each component lies in [-1, 1]. Let 0 be rest where there is one: costs on actions pull there.
     pub action_size: usize,
     /// Control steps in an episode; reaching this limit is a truncation, not a termination.
     pub horizon: usize,
@@ -38,7 +38,8 @@ pub struct Spec {
     pub stages: Vec<String>,
 }
 
-/// One number of an observation.
+/// One number of an observation. Ensembles predict its change over a time step, so observe an angle that can turn all the way round as
+/// its sine and cosine.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Feature {
@@ -46,7 +47,8 @@ pub struct Feature {
     pub name: String,
     /// A typical value.
     pub centre: f32,
-    /// A typical distance from `centre`: networks are fed (value - centre) / scale.
+    /// A typical distance from `centre`. SAC's networks are fed (value - centre) / scale, clamped to ±10, and latent models its symlog;
+    /// ensembles standardise by the data.
     pub scale: f32,
     /// How it changes over an episode: models predict only features that are [`Role::Dynamic`].
     pub role: Role,

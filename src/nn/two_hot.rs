@@ -66,6 +66,11 @@ impl SymexpBins {
         self.bins.len()
     }
 
+    /// Whether `y` lies between the outermost bins, so that its code decodes to it.
+    pub fn contains(&self, y: f32) -> bool {
+        y.abs() <= self.bins[self.bins.len() - 1]
+    }
+
     /// The two-hot code of `y`: a bin's index, and the weights of that bin and the next one, linear between the two. Numbers
     /// beyond the outermost bins get all their weight there.
     pub fn encode(&self, y: f32) -> (usize, [f32; 2]) {

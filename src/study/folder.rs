@@ -53,7 +53,7 @@ impl RunFolder {
         }
         if !file.exists() {
             if checkpoint.exists() {
-                read_own(&checkpoint, config)?;
+                check_own(&Weights::read(&checkpoint)?, &checkpoint, config)?;
             }
             files::write(&file, config.to_toml().as_bytes())?;
         }
@@ -72,7 +72,8 @@ impl RunFolder {
         if !path.exists() {
             return Ok(None);
         }
-        let state = read_own(&path, config)?;
+        let state = Weights::read(&path)?;
+        check_own(&state, &path, config)?;
         let foreign = |problem: Error| {
             let advice = format!("not a checkpoint of this run ({problem}); remove the folder to start anew");
             Error::checkpoint(&path, advice, Some(problem.into()))
@@ -240,13 +241,14 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
         let advice = "the run has saved no weights yet; let it train for longer";
         return Err(Error::Config(format!("{}: {advice}", folder.display())));
     }
-    let weights = read_own(&path, config).map_err(|problem| match problem {
+    let weights = Weights::read(&path).map_err(|problem| match problem {
         // Checkpoints hold the weights, too.
-        Error::Checkpoint { .. } if Weights::read(&path).is_err() && folder.join(CHECKPOINT).is_file() => {
+        Error::Checkpoint { .. } if folder.join(CHECKPOINT).is_file() => {
             Error::checkpoint(&path, "damaged; the command that made the run writes it anew", Some(problem.into()))
         }
         problem => problem,
     })?;
+    check_own(&weights, &path, config)?;
     check_saved(&weights, &path)?;
     let loaded = method.checkpoint_mut().load_weights(&weights);
     loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))
@@ -263,9 +265,9 @@ fn check_saved(weights: &Weights, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Reads a checkpoint or weights, unless they are another run's. (Those of the first edition do not say whose they are.)
-fn read_own(path: &Path, config: &RunConfig) -> Result<Weights> {
-    let weights = Weights::read(path)?;
+/// # Errors
+/// If a checkpoint or weights are another run's. (Those of the first edition do not say whose they are.)
+fn check_own(weights: &Weights, path: &Path, config: &RunConfig) -> Result<()> {
     if let Some(text) = weights.note(RUN) {
         let theirs = RunConfig::from_toml(text).map_err(|problem| bad_config(path, &problem))?;
         if let Some(difference) = difference(&theirs.to_table(), &config.to_table()) {
@@ -273,7 +275,7 @@ fn read_own(path: &Path, config: &RunConfig) -> Result<Weights> {
             return Err(Error::checkpoint(path, advice, None));
         }
     }
-    Ok(weights)
+    Ok(())
 }
 
 /// # Errors

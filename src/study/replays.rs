@@ -109,22 +109,23 @@ pub fn record(
     // A table that cannot be read is written anew.
     let recorded = read(folder).unwrap_or_default();
     let episodes: Vec<(Replay, &Path)> = chosen(runs);
-    let outcomes: Vec<Result<Replay>> = episodes
+    let outcomes: Vec<Result<Option<Replay>>> = episodes
         .into_par_iter()
         .map(|(replay, run)| {
             if !recorded.contains(&replay) || replay.recorded(folder).is_err() {
                 if stop.load(Ordering::Relaxed) {
                     return Err(Error::Interrupted);
                 }
-                files::write(&folder.join(&replay.file), &recording(registry, &replay, run)?)?;
+                let Some(bytes) = recording(registry, &replay, run)? else { return Ok(None) };
+                files::write(&folder.join(&replay.file), &bytes)?;
             }
-            Ok(replay)
+            Ok(Some(replay))
         })
         .collect();
     let (mut rows, mut problems) = (Vec::new(), Vec::new());
     for outcome in outcomes {
         match outcome {
-            Ok(replay) => rows.push(replay),
+            Ok(replay) => rows.extend(replay),
             Err(problem @ (Error::Io { .. } | Error::Interrupted)) => return Err(problem),
             Err(problem) => problems.push(problem.to_string()),
         }
@@ -322,11 +323,11 @@ fn chosen(runs: &[(RunConfig, PathBuf)]) -> Vec<(Replay, &Path)> {
     episodes
 }
 
-/// Lets the run's agent act in the episode again, and compresses the recording.
+/// Lets the run's agent act in the episode again, and compresses the recording. None if it shows nothing.
 ///
 /// # Errors
 /// If the agent cannot be read, or does not get the return that stands in the run's test.
-fn recording(registry: &Registry, replay: &Replay, run: &Path) -> Result<Vec<u8>> {
+fn recording(registry: &Registry, replay: &Replay, run: &Path) -> Result<Option<Vec<u8>>> {
     let (config, mut method) = registry.trained_method(run)?;
     let (env, episode) = (registry.make_env(&config)?, replay.episode - 1);
     let seed = config.starts.test().seed(episode)?;
@@ -341,5 +342,5 @@ fn recording(registry: &Registry, replay: &Replay, run: &Path) -> Result<Vec<u8>
             replay.total
         )));
     }
-    Ok(gzip(&recording.to_json()))
+    Ok(recording.is_visible().then(|| gzip(&recording.to_json())))
 }

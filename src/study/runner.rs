@@ -135,6 +135,17 @@ pub(crate) fn run_folder(study: &Path, task: &str, method: &str, seed: u64) -> P
     study.join(task).join(method).join(format!("seed{seed}"))
 }
 
+/// The complete runs in the folder of a study that are not among these.
+#[cfg(all(feature = "cli", feature = "study"))]
+pub(crate) fn other_complete_runs(study: &Path, runs: &[(RunConfig, PathBuf)]) -> Vec<PathBuf> {
+    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let there = inside(study.into()).flat_map(inside).flat_map(inside);
+    let others = there.filter(|folder| runs.iter().all(|(_, run)| run != folder));
+    let is_a_complete_run =
+        |folder: &PathBuf| super::folder::read_config(folder).is_ok_and(|(_, config)| is_complete(folder, &config));
+    others.filter(is_a_complete_run).collect()
+}
+
 /// Receives the progress of the runs; `&()` ignores it. Calls come from several threads.
 pub trait StudyObserver: Sync {
     /// A run begins, or goes on after `done` steps.
@@ -180,10 +191,12 @@ pub fn carry_out(
     }
 }
 
-/// Carries out all runs that are not complete yet, `jobs` at a time, each with its share of the cores.
+/// Carries out all runs that are not complete yet, `jobs` at a time, each with its share of the cores. If a run fails by itself, the
+/// others go on.
 ///
 /// # Errors
-/// The first error of a run; the others are then stopped and saved.
+/// [`Error::Run`] for the first run that diverged, or whose environment or agent failed. Any other error of a run, such as a full disk;
+/// the others are then stopped and saved.
 pub fn carry_out_all(
     registry: &Registry,
     runs: &[(RunConfig, PathBuf)],
@@ -193,7 +206,7 @@ pub fn carry_out_all(
 ) -> Result<()> {
     let jobs = jobs.clamp(1, runs.len().max(1));
     let next = AtomicUsize::new(0);
-    let failure = Mutex::new(None);
+    let (failure, failed_run) = (Mutex::new(None), Mutex::new(None));
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     std::thread::scope(|scope| {
         for _ in 0..jobs {
@@ -214,12 +227,24 @@ pub fn carry_out_all(
                     if is_complete(folder, &registry.as_begun(config, folder)) {
                         continue;
                     }
-                    if let Err(error) = pool.install(|| carry_out(registry, index, config, folder, observer, stop)) {
-                        return fail(error);
+                    match pool.install(|| carry_out(registry, index, config, folder, observer, stop)) {
+                        Ok(()) => {}
+                        Err(problem) if is_its_own(&problem) => {
+                            let error = Error::Run { folder: folder.clone(), source: Box::new(problem) };
+                            failed_run.lock().expect("no panic holds it").get_or_insert(error);
+                        }
+                        Err(problem) => return fail(problem),
                     }
                 }
             });
         }
     });
-    failure.into_inner().expect("no panic holds it").map_or(Ok(()), Err)
+    let [failure, failed_run] = [failure, failed_run].map(|error| error.into_inner().expect("no panic holds it"));
+    failure.or(failed_run).map_or(Ok(()), Err)
+}
+
+/// Whether an error says nothing about the other runs of a study.
+fn is_its_own(problem: &Error) -> bool {
+    use Error::{Action, Contract, Diverged, Environment};
+    matches!(problem, Diverged { .. } | Contract { .. } | Environment { .. } | Action { .. })
 }

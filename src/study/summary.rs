@@ -16,6 +16,8 @@ struct Runs {
     method: String,
     /// For each seed, whether each test episode succeeded, in the order of the starts.
     success: Vec<Vec<f64>>,
+    /// For each seed, the return of each test episode, in the same order; empty if the tables do not have them.
+    returns: Vec<Vec<f64>>,
     /// For each seed, the success curve; empty if the method does not learn.
     curves: Vec<Curve>,
     /// For each seed, the seconds of training until each evaluation; empty if the tables do not have them.
@@ -56,6 +58,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
         let success = lists(&rows, "success")?;
+        let returns = if there.contains(&"return") { lists(&rows, "return")? } else { Vec::new() };
         let over_steps = |column: &str| optional_curves(evaluations, &task, &method, column);
         let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
         let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
@@ -67,7 +70,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
             Ok(numbers(&at_the_end, column)?.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())
         };
         let expectations = [of_values("expected")?, of_values("realised")?, of_values("correlation")?];
-        all.push(Runs { task, method, success, curves, clocks, action_ms, updates, expectations, means });
+        all.push(Runs { task, method, success, returns, curves, clocks, action_ms, updates, expectations, means });
     }
     let names = |of: fn(&Runs) -> &String| all.iter().map(|runs| of(runs).clone()).collect::<Vec<String>>();
     let mut columns =
@@ -85,7 +88,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
 }
 
 /// The columns after task and method. Scripts read them by name: new ones are added at the end, none is removed.
-const SUMMARY: [&str; 44] = [
+const SUMMARY: [&str; 51] = [
     "seeds",
     "steps",
     "test_episodes",
@@ -130,6 +133,13 @@ const SUMMARY: [&str; 44] = [
     "success_minus_sac_t_high",
     "sac_steps_ratio_t_low",
     "sac_steps_ratio_t_high",
+    "return_t_low",
+    "return_t_high",
+    "return_minus_sac",
+    "return_minus_sac_low",
+    "return_minus_sac_high",
+    "return_minus_sac_t_low",
+    "return_minus_sac_t_high",
 ];
 
 /// The stream of every bootstrap: the tables alone decide its result.
@@ -166,7 +176,7 @@ impl Runs {
     }
 
     fn row(&self, all: &[Self]) -> Vec<(&'static str, Option<f64>)> {
-        let by_seed = self.by_seed();
+        let by_seed = means(&self.success);
         let episodes = self.success.concat();
         let [low, high] = success_interval(&self.success);
         let mut row = self.means.clone();
@@ -190,6 +200,9 @@ impl Runs {
         if let Some(ends) = t_interval(&by_seed).filter(|[low, high]| low < high) {
             let [low, high] = ends.map(|end| Some(end.clamp(0.0, 1.0)));
             row.extend([("success_t_low", low), ("success_t_high", high)]);
+        }
+        if let Some([low, high]) = t_interval(&means(&self.returns)) {
+            row.extend([("return_t_low", Some(low)), ("return_t_high", Some(high))]);
         }
         if let Some(budget) = self.budget() {
             let times = self.times();
@@ -227,11 +240,6 @@ impl Runs {
         row
     }
 
-    /// The success rate of each seed.
-    fn by_seed(&self) -> Vec<f64> {
-        self.success.iter().map(|episodes| mean(episodes)).collect()
-    }
-
     /// The comparison with the baseline's runs on the same task.
     fn against(&self, baseline: &Self) -> Vec<(&'static str, Option<f64>)> {
         let (difference, [low, high]) = paired_difference(&self.success, &baseline.success, &mut stream());
@@ -240,14 +248,22 @@ impl Runs {
             ("success_minus_sac_low", Some(low)),
             ("success_minus_sac_high", Some(high)),
         ];
-        if let Some([low, high]) = welch_interval(&self.by_seed(), &baseline.by_seed()) {
+        if let Some([low, high]) = welch_interval(&means(&self.success), &means(&baseline.success)) {
             let [low, high] = [low, high].map(|end| Some(end.clamp(-1.0, 1.0)));
             row.extend([("success_minus_sac_t_low", low), ("success_minus_sac_t_high", high)]);
+        }
+        if !self.returns.is_empty() && !baseline.returns.is_empty() {
+            let (difference, [low, high]) = paired_difference(&self.returns, &baseline.returns, &mut stream());
+            let entries = ["return_minus_sac", "return_minus_sac_low", "return_minus_sac_high"];
+            row.extend(entries.into_iter().zip([difference, low, high].map(Some)));
+            if let Some(ends) = welch_interval(&means(&self.returns), &means(&baseline.returns)) {
+                row.extend(["return_minus_sac_t_low", "return_minus_sac_t_high"].into_iter().zip(ends.map(Some)));
+            }
         }
         for (entries, (probability, [low, high])) in [
             (
                 ["improvement_over_sac", "improvement_over_sac_low", "improvement_over_sac_high"],
-                probability_of_improvement(&self.by_seed(), &baseline.by_seed(), &mut stream()),
+                probability_of_improvement(&means(&self.success), &means(&baseline.success), &mut stream()),
             ),
             (
                 ["earlier_than_sac", "earlier_than_sac_low", "earlier_than_sac_high"],
@@ -274,6 +290,11 @@ impl Runs {
         }
         row
     }
+}
+
+/// The mean over the episodes of each seed.
+fn means(seeds: &[Vec<f64>]) -> Vec<f64> {
+    seeds.iter().map(|episodes| mean(episodes)).collect()
 }
 
 /// The last values of each run.

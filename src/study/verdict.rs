@@ -45,10 +45,12 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
     let Some((steps, first)) = earliest(&medians) else {
         return Ok(format!("no method reaches {level:.0} % success in its median seed."));
     };
-    let mut informed = Vec::new();
+    let (mut informed, mut uninformed) = (Vec::new(), Vec::new());
     for method in learning {
-        if tables.is_told_the_reward(task, method)? {
-            informed.push(*method);
+        match tables.is_told_the_reward(task, method)? {
+            Some(true) => informed.push(*method),
+            Some(false) => uninformed.push(*method),
+            None => {}
         }
     }
     let mut text = format!("{} first to reach {level:.0} % success, by step {steps:.0} (median).", are(&first));
@@ -57,9 +59,9 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
         return Ok(text);
     }
     text += &format!(" {} told the reward function", are(&told));
-    medians.retain(|(_, method)| !informed.contains(method));
+    medians.retain(|(_, method)| uninformed.contains(method));
     text += &match earliest(&medians) {
-        _ if told.len() < first.len() || informed.len() == learning.len() => ".".into(),
+        _ if told.len() < first.len() || uninformed.is_empty() => ".".into(),
         Some((steps, first)) => format!("; of the methods that are not, {} first, by step {steps:.0}.", are(&first)),
         None => format!("; no method without it reaches {level:.0} % in its median seed."),
     };
@@ -95,7 +97,15 @@ const SEEDS: f64 = 4.0;
 fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result<Vec<String>> {
     let mut points = Vec::new();
     let level = 100.0 * LEVEL;
-    for (column, none, measure, better, worse, open) in [
+    let of_return = (
+        "return_minus_sac",
+        0.0,
+        String::from("test returns"),
+        String::from("Significantly higher test returns than"),
+        String::from("Significantly lower test returns than"),
+        String::from("No significant difference in test returns from"),
+    );
+    let of_success = [
         (
             "sac_steps_ratio",
             1.0,
@@ -112,7 +122,9 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
             "Significantly less test success than".into(),
             "No significant difference in test success from".into(),
         ),
-    ] {
+    ];
+    let comparisons = if tables.is_judged_by_return(task)? { vec![of_return] } else { of_success.into() };
+    for (column, none, measure, better, worse, open) in comparisons {
         let late = format!("Not every seed reaches {level:.0} % within its budget, so there is no ratio of steps to");
         let at_once = format!("Some seeds are at {level:.0} % at step 0, so there is no ratio of steps to");
         let few = format!("Fewer than {SEEDS:.0} seeds of one of the two, too few to compare {measure} with");

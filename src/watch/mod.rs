@@ -120,6 +120,11 @@ impl Recording {
         Ok(Self { title, task: spec.name.clone(), dt: spec.dt, up: "z", camera, bodies, frames, paths })
     }
 
+    /// Whether there is something to see: bodies, or what an agent imagined.
+    pub fn is_visible(&self) -> bool {
+        !self.bodies.is_empty() || self.paths.iter().any(|paths| !paths.is_empty())
+    }
+
     /// Steps in the episode.
     pub fn steps(&self) -> usize {
         self.frames.len() - 1

@@ -10,7 +10,7 @@ use std::sync::atomic::AtomicBool;
 
 use handful::checkpoint::Weights;
 use handful::prelude::*;
-use handful::study::run::Event;
+use handful::study::run::{Event, is_complete};
 use handful::study::runner::{StudyPlan, carry_out_all};
 use handful::watch::Recording;
 use own_world::{Puck, registry};
@@ -55,7 +55,7 @@ fn a_study_of_the_puck_ends_in_a_report() {
         let tables = handful::study::tables::Tables::gather(folders).expect("the runs' tables");
         tables.write(folder.path()).expect("a writable folder");
         for (method, told) in [("pets", true), ("pets-learned", false), ("dreamer", false), ("sac", false)] {
-            assert_eq!(tables.is_told_the_reward("puck", method).expect("configurations"), told, "{method}");
+            assert_eq!(tables.is_told_the_reward("puck", method).expect("configurations"), Some(told), "{method}");
         }
         let text = handful::study::report::write(folder.path(), folder.path()).expect("a report");
         assert!(text.contains("puck") && text.contains("pets-learned"), "{text}");
@@ -142,13 +142,42 @@ fn a_broken_contract_is_told_and_nothing_is_lost() {
         .env(EnvEntry::new("broken", || Ok(Broken { puck: Puck::default(), steps: 0 })))
         .preset("small", sac);
     let config = registry.config("broken", "small", 0, None, None).expect("a preset");
-    let run = [(config, folder.path().join("run"))];
+    let healthy = registry.config("pendulum", "small", 0, Some(200), None).expect("a preset");
+    let run = [(config, folder.path().join("run")), (healthy, folder.path().join("other"))];
     let problem = carry_out_all(&registry, &run, 1, &(), &AtomicBool::new(false)).expect_err("it is broken");
-    assert!(matches!(problem, Error::Contract { .. }), "{problem}");
+    assert!(is_complete(&run[1].1, &run[1].0), "the other run goes on");
+    let Error::Run { folder, source } = &problem else { panic!("of a run: {problem}") };
+    assert_eq!(*folder, run[0].1);
+    assert!(matches!(**source, Error::Contract { .. }), "{problem}");
     assert!(problem.to_string().contains("reward"), "{problem}");
     let episodes = std::fs::read_to_string(run[0].1.join("episodes.csv")).expect("the episodes before");
     assert_eq!(episodes.lines().count(), 1 + 4, "four episodes of 50 steps, and the header");
     assert!(run[0].1.join("weights.safetensors").exists());
+}
+
+/// A replay of a world that draws nothing would be an empty page.
+#[test]
+fn a_world_that_draws_nothing_is_not_visible() {
+    let mut random = Random::new(Puck::default().spec(), 0);
+    let of = |env: Box<dyn Env>, random: &mut Random| Recording::of_episode("puck".into(), env, random, 0);
+    let broken = Broken { puck: Puck::default(), steps: 0 };
+    for (env, visible) in [(Box::new(Puck::default()) as Box<dyn Env>, true), (Box::new(broken), false)] {
+        assert_eq!(of(env, &mut random).expect("valid actions").is_visible(), visible);
+    }
+}
+
+/// A variant of an agent has the settings of the preset that it is based on, also those for the task.
+#[test]
+fn a_variant_builds_on_a_preset() {
+    let registry = Registry::standard()
+        .agent("pets-mine", |context, config: PetsConfig| {
+            Pets::new(context.spec, context.known_reward()?, config, context.seed)
+        })
+        .preset("pets-mine", "base = \"pets\"\nagent = \"pets-mine\"\n[pets-mine]\nwarm_up = 77\n");
+    let config = |method| registry.config("reach", method, 0, None, None).expect("a preset").settings;
+    let (mut base, variant) = (config("pets"), config("pets-mine"));
+    base.insert("warm_up".into(), 77.into());
+    assert_eq!(variant, base);
 }
 
 /// Repeats the action that earned most.

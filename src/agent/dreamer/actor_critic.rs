@@ -194,7 +194,9 @@ impl ActorCritic {
         });
         let target_values = world.bins().decode(&target.forward(features.clone(), Grad::Input));
         let critic = self.critic_loss(tape, world, &features, Grad::Params, [&returns, &target_values], &weights);
+        let beyond = returns.iter().filter(|target| !world.bins().contains(**target)).count();
         let report = Losses::from([
+            ("targets_beyond_bins", beyond as f32 / returns.len() as f32),
             ("policy_loss", ops::mean(&policy)),
             ("critic_loss", ops::mean(&critic)),
             ("policy_entropy", mean(&entropies)),

@@ -4,7 +4,7 @@
 //! A goal is a feature that is constant over an episode and compared with a dynamic one by a
 //! [`Role::Difference`]; the dynamic one is what was achieved. The new goal is what a later time step of the same episode achieved
 //! (the paper's strategy *future*), the difference is computed anew, and so are the reward, which therefore has to be known, and
-//! whether the task has ended.
+//! whether the task has ended. No other feature may depend on the goal.
 
 use rand::RngExt;
 
@@ -36,6 +36,13 @@ impl Hindsight {
         let goals: Vec<_> = differences.iter().map(|&[_, a, b]| if constant(a) { [a, b] } else { [b, a] }).collect();
         if goals.is_empty() {
             return Err(refused("has no goal: no constant feature that another one is compared with"));
+        }
+        let twice = |goal: &[usize; 2]| goals.iter().find(|other| other[0] == goal[0] && other[1] != goal[1]).copied();
+        if let Some((goal, other)) = goals.iter().find_map(|goal| Some((goal, twice(goal)?))) {
+            let [goal, a, b] = [goal[0], goal[1], other[1]].map(|i| &spec.observation[i].name);
+            return Err(refused(&format!(
+                "compares `{goal}` with both `{a}` and `{b}`: which of them is to reach it?"
+            )));
         }
         Ok(Self { share, goals, differences, reward })
     }
@@ -172,6 +179,16 @@ mod tests {
     }
 
     /// On the arm's tasks a transition whose goal was relabelled has the reward that the environment would have given.
+    #[test]
+    fn a_goal_that_two_features_are_compared_with_is_refused() {
+        let [by_hand, by_cube] =
+            ["hand", "cube"].map(|what| Feature::new(format!("{what} to goal")).difference("goal", what));
+        let features = [Feature::new("hand"), Feature::new("cube"), Feature::new("goal").constant(), by_hand, by_cube];
+        let spec = Spec::new("carry", features, 1, 4, 0.1);
+        let problem = Hindsight::new(&spec, Some(Arc::new(There)), 0.5).map(|_| ()).expect_err("two of them");
+        assert!(problem.to_string().contains("compares `goal` with both `hand` and `cube`"), "{problem}");
+    }
+
     #[test]
     fn tasks_with_goals_can_be_relabelled() {
         for task in [Task::Reach, Task::Push] {

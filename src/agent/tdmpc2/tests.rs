@@ -182,6 +182,25 @@ fn a_decision_that_was_cut_short_is_not_learned_from() {
     }
 }
 
+/// Plans go on beyond ends that the model does not predict, and the losses say that there are some.
+#[test]
+fn ends_that_are_not_modelled_are_counted() {
+    let spec = Spec::new("fall", [Feature::new("height")], 1, 4, 0.05);
+    for terminates in [false, true] {
+        let model = ImplicitConfig { terminates, ..ImplicitConfig::default() };
+        let config = TdMpc2Config { model, horizon: 2, batch: 8, ..TdMpc2Config::default() };
+        let mut agent = TdMpc2::new(&spec, config, 0).expect("usable settings");
+        for i in (0..2_u8).chain(0..2) {
+            let [obs, next_obs] = [i, i + 1].map(|height| vec![f32::from(height)]);
+            let action = vec![0.0];
+            agent.observe(&Transition { obs, action, reward: 0.0, next_obs, terminated: i == 1, truncated: false });
+        }
+        let losses = agent.learn().expect("two episodes");
+        // Every slice of two steps has an end.
+        assert_eq!(losses.get("ends_not_modelled").copied(), (!terminates).then_some(1.0));
+    }
+}
+
 /// An agent that counts quarter rewards in quarters learns and plans as one that counts whole rewards, and its estimates are in
 /// the unit of the rewards.
 #[test]

@@ -15,7 +15,8 @@ impl TdMpc2 {
     /// One update on freshly drawn slices of `horizon` steps; `None` while no episode is that long. Returns the means of
     /// `consistency_loss`, `reward_loss`, `value_loss` and `policy_loss`; `policy_entropy`, in nats; `target`, the mean value target, `q`, the mean value of the
     /// policy's actions, and `value_scale`, all three in multiples of [`TdMpc2Config::reward_unit`](super::TdMpc2Config::reward_unit);
-    /// `targets_beyond_bins`, the share of targets that no bin holds (more than a few: raise `bin_limit`); `latent_drift`
+    /// `targets_beyond_bins`, the share of targets that no bin holds (more than a few: raise `bin_limit`); `ends_not_modelled`, without
+    /// [`terminates`](crate::model::ImplicitConfig::terminates), the terminations per slice (more than 0: set it); `latent_drift`
     /// ([`drift`](crate::model::ImplicitLoss::drift)); and the norms of the gradients before clipping.
     pub fn learn(&mut self) -> Option<Losses> {
         let Self { config, networks, scale, discount, replay, rng, .. } = self;
@@ -34,6 +35,10 @@ impl TdMpc2 {
         losses.insert("target", targets.iter().sum::<f32>() / targets.len() as f32);
         let beyond = targets.iter().filter(|target| !networks.model.bins().contains(**target)).count();
         losses.insert("targets_beyond_bins", beyond as f32 / targets.len() as f32);
+        if !config.model.terminates {
+            let ends = batch.terminal.iter().filter(|end| **end).count();
+            losses.insert("ends_not_modelled", ends as f32 / batch.sequences as f32);
+        }
         let mut gradients = ops::total(tape, &weighted).backward();
         losses.insert("model_gradient", self.model_optimiser.step(&mut networks.model, &mut gradients));
         networks.model.select_inputs(config.learning_rate, config.lasso);

@@ -19,7 +19,7 @@ pub(super) const LIFTED: f64 = 0.04;
 pub(super) const CUBE: usize = GRIPPER.end;
 const HAND_TO_CUBE: usize = CUBE + 12;
 
-/// Grasp the cube and lift it 4 cm off the table: robosuite's Lift, with its numbers (but see [`TableTask::horizon`]).
+/// Grasp the cube and lift its centre to more than 4 cm above the table: robosuite's Lift, with its numbers (but see [`TableTask::horizon`]).
 #[derive(Clone, Copy, Debug)]
 pub struct Lift;
 

@@ -107,8 +107,8 @@ pub struct TabletopState {
     physics: Physics,
     setup: Setup,
     controller: OperationalSpaceController,
-    /// Kinematics at the start of the last physics step. robosuite sets its goals from these, one
-    /// physics step old; so do we.
+    /// Kinematics at the start of the last physics step. The controller's target is set from these, one physics step old;
+    /// robosuite's from the present ones.
     measured: Kinematics,
     /// Joint velocities at that time, rad/s.
     measured_qd: JointVector,

@@ -114,13 +114,15 @@ fn tuning_note(tables: &Tables) -> Result<&'static str> {
 
 /// What all methods have in common, and what some know that the others do not.
 fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
-    let mut told = BTreeSet::new();
+    let (mut told, mut unknown) = (BTreeSet::new(), BTreeSet::new());
     for (task, method) in pairs {
-        if tables.is_told_the_reward(task, method)? {
-            told.insert(format!("`{method}`"));
+        match tables.is_told_the_reward(task, method)? {
+            Some(true) => _ = told.insert(format!("`{method}`")),
+            Some(false) => {}
+            None => _ = unknown.insert(format!("`{method}`")),
         }
     }
-    let told: Vec<String> = told.into_iter().collect();
+    let [told, unknown] = [told, unknown].map(|methods| methods.into_iter().collect::<Vec<String>>());
     let mut text = String::from(
         "All methods of a task start from the same initial states. They are evaluated without exploration noise (planners still \
          sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \
@@ -128,7 +130,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
     );
     if !told.is_empty() {
         text += &format!(
-            "\nThe methods do not have the same information: {} know{} the reward as a function{}. The other learning methods have \
+            "\nThe methods do not have the same information: {} know{} the reward as a function{}{}. The other learning methods have \
              only the rewards that they receive.\n",
             listed(&told),
             if told.len() == 1 { "s" } else { "" },
@@ -137,6 +139,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
             } else {
                 ""
             },
+            if unknown.is_empty() { String::new() } else { format!("; of {}, it is not known", listed(&unknown)) },
         );
     }
     for difference in tables.differences_of_environments()? {

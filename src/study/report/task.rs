@@ -73,6 +73,10 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
     let mut text = String::new();
     for method in tables.methods(task)? {
         let value = |column: &str| tables.value(task, &method, column);
+        if tables.is_judged_by_return(task)? {
+            text += &of_return(tables, task, &method)?;
+            continue;
+        }
         let (success, level) = (100.0 * value("success")?.unwrap_or(0.0), 100.0 * LEVEL);
         let (Some(budget), Some(reaching), Some(seeds)) =
             (value("steps")?, value("seeds_reaching_80")?, value("seeds")?)
@@ -103,6 +107,27 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
         text.push('\n');
     }
     Ok(text)
+}
+
+/// The returns of a method in words, on a task where no evaluation succeeds.
+fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
+    let value = |column: &str| tables.value(task, method, column);
+    let interval = |column: &str| -> Result<String> {
+        Ok(match (value(&format!("{column}_low"))?, value(&format!("{column}_high"))?) {
+            (Some(low), Some(high)) => format!(" [{low:.1}, {high:.1}]"),
+            _ => String::new(),
+        })
+    };
+    let Some(mean) = value("return_mean")? else { return Ok(String::new()) };
+    let mut text = format!("- `{method}` has a mean test return of {mean:.1}{}.", interval("return_t")?);
+    if let Some(difference) = value("return_minus_sac")? {
+        text += &format!(
+            " From the same test starts, minus that of `{BASELINE}`: {difference:+.1}{}, t interval{}.",
+            interval("return_minus_sac")?,
+            interval("return_minus_sac_t")?
+        );
+    }
+    Ok(text + "\n")
 }
 
 /// The numbers of the methods that learn a task which the first table has no room for.

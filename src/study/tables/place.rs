@@ -32,11 +32,13 @@ pub(crate) fn check_place(folder: &Path, runs: &[(RunConfig, PathBuf)]) -> Resul
     let there = |(task, method, seed): &RunName| run_folder(folder, task, method, *seed).is_dir();
     // One of the tables may be lost or damaged.
     let formats = [("tests.csv", &read::TESTS), ("runs.csv", &read::RUNS), ("evaluations.csv", &read::EVALUATIONS)];
-    let tables: Vec<Result<Vec<RunName>>> =
-        formats.map(|(file, format)| runs_in_table(&folder.join(file), format)).into();
-    let (known, problems): (Vec<_>, Vec<_>) = tables.into_iter().partition(|table| table.is_ok());
-    let known: Vec<RunName> = known.into_iter().flatten().flatten().collect();
-    let problem = problems.into_iter().find_map(Result::err);
+    let (mut known, mut problem) = (Vec::new(), None);
+    for (file, format) in formats {
+        match runs_in_table(&folder.join(file), format) {
+            Ok(runs) => known.extend(runs),
+            Err(damage) => problem = problem.or(Some(damage)),
+        }
+    }
     match problem {
         Some(problem) if known.is_empty() && !runs.iter().any(|(_, run)| run.is_dir()) => Err(problem),
         _ => check(folder, &known, |run| ours(run) || there(run)),

@@ -6,6 +6,7 @@ use std::path::Path;
 use polars::prelude::*;
 
 use super::{Tables, inside, numbers, strings};
+use crate::agent::method_names;
 use crate::error::{Error, Result, shortened};
 use crate::study::config::upgrade_keys;
 use crate::study::folder::difference;
@@ -58,20 +59,17 @@ impl Tables {
         Ok(column("run")?.into_iter().zip(column("reason")?).collect())
     }
 
-    /// Whether a method, of one of our agents, has the reward of a task as a function: as its runs' configuration says, or its name where
-    /// that is not recorded. The others have only the rewards that they receive.
+    /// Whether a method has the reward of a task as a function, or only the rewards that it receives: as its runs' configuration says,
+    /// or its name where that is not recorded. None for agents that are not this library's.
     ///
     /// # Errors
     /// If the table lacks a column, or a configuration is not TOML.
-    pub fn is_told_the_reward(&self, task: &str, method: &str) -> Result<bool> {
+    pub fn is_told_the_reward(&self, task: &str, method: &str) -> Result<Option<bool>> {
         let mut runs = self.runs()?;
         runs.retain(|run| run.task == task && run.method == method);
         let settings = settings(&runs)?;
-        Ok(if settings.is_empty() {
-            is_told_by_name(method)
-        } else {
-            settings.values().any(|settings| is_told(settings, method))
-        })
+        // Runs of one method have the same settings.
+        Ok(settings.values().next().map_or_else(|| is_told_by_name(method), |settings| is_told(settings, method)))
     }
 
     /// Sentences that say which methods of a task do not have the same environment, or plan with another reward than the one that is
@@ -91,7 +89,7 @@ impl Tables {
             let planned = planned.as_ref().and_then(toml::Value::as_str);
             let measured = env.get("reward").and_then(toml::Value::as_str);
             if let Some(planned) = planned.filter(|planned| Some(*planned) != measured)
-                && is_told(settings, &method)
+                && is_told(settings, &method) == Some(true)
             {
                 sentences.push(format!(
                     "On `{task}`, `{method}` knows another reward (`{planned}`) than the one that is measured and that the others \
@@ -124,27 +122,28 @@ impl Tables {
     }
 }
 
-/// Whether a run with these settings has the reward as a function.
-fn is_told(settings: &toml::Table, method: &str) -> bool {
+/// Whether a run with these settings has the reward as a function. None for agents that are not ours.
+fn is_told(settings: &toml::Table, method: &str) -> Option<bool> {
     let of = |path: &[&str]| path.iter().try_fold(settings, |table, name| table.get(*name)?.as_table());
     match settings.get("agent").and_then(toml::Value::as_str) {
-        Some("oracle") => true,
+        Some("oracle") => Some(true),
         Some("pets") => {
             let learns = of(&["pets", "ensemble"]).and_then(|table| table.get("learn_reward")?.as_bool());
-            !learns.unwrap_or(false)
+            Some(!learns.unwrap_or(false))
         }
         Some("sac") => {
             let relabelled = of(&["sac"]).and_then(|table| table.get("hindsight")?.as_float());
-            relabelled.unwrap_or(0.0) > 0.0
+            Some(relabelled.unwrap_or(0.0) > 0.0)
         }
-        Some(_) => false,
+        Some("random" | "scripted" | "dreamer" | "tdmpc2") => Some(false),
+        Some(_) => None,
         None => is_told_by_name(method),
     }
 }
 
 /// The same where its settings are not recorded.
-fn is_told_by_name(method: &str) -> bool {
-    ["oracle", "pets"].contains(&method)
+fn is_told_by_name(method: &str) -> Option<bool> {
+    method_names().any(|name| name == method).then(|| ["oracle", "pets"].contains(&method))
 }
 
 /// Every run was tested, and of a method that learns every run was evaluated.
