@@ -45,7 +45,7 @@ pub enum Error {
     Contract {
         /// The environment.
         env: String,
-        /// The rule that was broken, at which step of which episode.
+        /// The rule that was broken, and where it is known, at which step of which episode.
         rule: String,
     },
     /// An environment that failed, for instance because a simulator or a device behind it did.

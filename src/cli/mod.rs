@@ -120,11 +120,11 @@ fn refuse_folder_of(what: &str, file: &str, folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Says so if a run ends before its agent begins to learn.
+/// Says so if a run ends within the warm-up of its agent.
 fn note_long_warm_up(config: &RunConfig) {
-    let warm_up = config.settings.get("warm_up").and_then(toml::Value::as_integer);
+    let warm_up = config.settings.get("warm_up").filter(|_| config.learns()).and_then(toml::Value::as_integer);
     if let Some(warm_up) =
-        warm_up.filter(|warm_up| usize::try_from(*warm_up).is_ok_and(|warm_up| warm_up >= config.steps))
+        warm_up.filter(|warm_up| usize::try_from(*warm_up).is_ok_and(|warm_up| warm_up > config.steps))
     {
         let RunConfig { task, method, agent, steps, .. } = config;
         note(format_args!(

@@ -7,6 +7,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use super::output::note;
+use crate::error::Error;
 use crate::study::config::RunConfig;
 use crate::study::run::Event;
 use crate::study::runner::StudyObserver;
@@ -131,5 +132,13 @@ impl StudyObserver for Progress {
         if let (false, Some(line)) = (self.on_terminal, line) {
             note(line);
         }
+    }
+
+    fn failed(&self, run: usize, problem: &Error) {
+        let shown = self.runs[run].lock().expect("no panic holds it");
+        if let Some(bar) = &shown.bar {
+            bar.finish_and_clear();
+        }
+        self.bars.suspend(|| note(format_args!("{}: {problem}; the other runs go on", shown.name)));
     }
 }

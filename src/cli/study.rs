@@ -111,8 +111,10 @@ pub(super) fn run(registry: &Registry, args: Args) -> Result<()> {
         carried_out => Ok(carried_out?),
     };
     progress.finish();
-    let concluded = conclude(registry, &runs, &plan.folder, &stop);
-    failed.and(concluded)
+    match (failed, conclude(registry, &runs, &plan.folder, &stop)) {
+        (Err(_), Err(problem @ (Error::Interrupted | Error::Io { .. }))) => Err(problem),
+        (failed, concluded) => failed.and(concluded),
+    }
 }
 
 /// Of the methods that nobody asked for, those are left out that need something which one of the tasks does not have: a script, a

@@ -118,6 +118,8 @@ pub trait Env: std::any::Any + Send {
     /// Starts an episode; the seed fixes everything that is drawn at random in it. Returns the first observation,
     /// [`Spec::observation_size`] numbers.
     ///
+    /// It cannot fail: where it would, return finite numbers, and let the next [`Env::step`] say what went wrong.
+    ///
     /// Use all 64 bits of the seed, for example by [`rng::stream`](crate::rng::stream): seeds of training, evaluations and the test
     /// differ in their upper bits, and as a `u32` or an `f32` some of them would be equal.
     fn reset(&mut self, seed: u64) -> Vec<f32>;
@@ -126,7 +128,7 @@ pub trait Env: std::any::Any + Send {
     ///
     /// # Errors
     /// [`crate::error::Error::Action`] if the action has the wrong length or is not finite; nothing has moved then.
-    /// [`crate::error::Error::Environment`] if the environment itself fails, also for a reset that failed before.
+    /// [`crate::error::Error::Environment`] if the environment itself fails.
     fn step(&mut self, action: &[f32]) -> Result<Step>;
 
     /// Position (m) of the tracked point, a robot's hand for example; the smoothness of motion is measured there. None

@@ -47,8 +47,8 @@ pub struct Feature {
     pub name: String,
     /// A typical value.
     pub centre: f32,
-    /// A typical distance from `centre`. SAC's networks are fed (value - centre) / scale, clamped to ±10, and latent models its symlog;
-    /// ensembles standardise by the data.
+    /// A typical distance from `centre`. SAC's networks are fed (value - centre) / scale, clamped to ±10; latent models, and SAC with
+    /// `latent_features`, its symlog. The dynamics of ensembles are standardised by the data, with a part of the scale as a floor.
     pub scale: f32,
     /// How it changes over an episode: models predict only features that are [`Role::Dynamic`].
     pub role: Role,

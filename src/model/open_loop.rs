@@ -81,8 +81,8 @@ pub trait OpenLoopModel {
     fn open_loop_predictions(&self, starts: &[(&Episode, usize)], horizon: usize, rng: &mut Rng) -> Vec<Vec<f32>>;
 }
 
-/// Evaluates a model on held-out episodes of the environment with this `spec`, one row for each of the [`HORIZONS`] that is no
-/// longer than half of the episodes and over which some feature moves differently from start to start; no rows without episodes.
+/// Evaluates a model on held-out episodes of the environment with this `spec`, one row for each of the [`HORIZONS`] for which
+/// at least half of the episodes are long enough, and over which some feature moves differently from start to start; no rows without episodes.
 #[doc(alias = "open loop")]
 pub fn open_loop(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
     let mut lengths: Vec<usize> = episodes.iter().map(|episode| episode.actions.len()).collect();

@@ -292,6 +292,9 @@ pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
     let unknown = message.strip_prefix("unknown field `").and_then(|rest| rest.rsplit_once("`, expected"));
     let problem = match unknown {
         Some((field, known)) => Error::unknown("field", field, known.split('`').skip(1).step_by(2)).to_string(),
+        None if message.contains("unit variant, expected newtype variant") => {
+            "a name alone is not enough: write `{ NAME = VALUE }`, or `{ NAME = {} }` if its value is a table of settings".into()
+        }
         None => shortened(message.trim_end(), 300),
     };
     // The path of the field is told only as the last line of the whole message, and the line of the file in its first.

@@ -152,6 +152,8 @@ pub trait StudyObserver: Sync {
     fn started(&self, _run: usize, _config: &RunConfig, _done: usize) {}
     /// Something happened in a run, after `done` environment steps.
     fn happened(&self, _run: usize, _config: &RunConfig, _done: usize, _event: &Event) {}
+    /// A run has failed for a reason of its own, and the others go on.
+    fn failed(&self, _run: usize, _problem: &Error) {}
 }
 
 impl StudyObserver for () {}
@@ -191,12 +193,12 @@ pub fn carry_out(
     }
 }
 
-/// Carries out all runs that are not complete yet, `jobs` at a time, each with its share of the cores. If a run fails by itself, the
-/// others go on.
+/// Carries out all runs that are not complete yet, `jobs` at a time, each with its share of the cores. If a run fails for a reason of its
+/// own, the others go on: if it diverges, its environment fails or breaks its contract, or its agent acts in a way that is refused.
 ///
 /// # Errors
-/// [`Error::Run`] for the first run that diverged, or whose environment or agent failed. Any other error of a run, such as a full disk;
-/// the others are then stopped and saved.
+/// [`Error::Run`] for the first run that failed so, when the others are complete. Any other error of a run, such as a full disk; the others
+/// are then stopped and saved.
 pub fn carry_out_all(
     registry: &Registry,
     runs: &[(RunConfig, PathBuf)],
@@ -230,6 +232,7 @@ pub fn carry_out_all(
                     match pool.install(|| carry_out(registry, index, config, folder, observer, stop)) {
                         Ok(()) => {}
                         Err(problem) if is_its_own(&problem) => {
+                            observer.failed(index, &problem);
                             let error = Error::Run { folder: folder.clone(), source: Box::new(problem) };
                             failed_run.lock().expect("no panic holds it").get_or_insert(error);
                         }

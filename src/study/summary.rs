@@ -16,7 +16,7 @@ struct Runs {
     method: String,
     /// For each seed, whether each test episode succeeded, in the order of the starts.
     success: Vec<Vec<f64>>,
-    /// For each seed, the return of each test episode, in the same order; empty if the tables do not have them.
+    /// For each seed, the return of each test episode, in the same order.
     returns: Vec<Vec<f64>>,
     /// For each seed, the success curve; empty if the method does not learn.
     curves: Vec<Curve>,
@@ -58,7 +58,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
             means.push((name, (!known.is_empty()).then(|| mean(&known))));
         }
         let success = lists(&rows, "success")?;
-        let returns = if there.contains(&"return") { lists(&rows, "return")? } else { Vec::new() };
+        let returns = lists(&rows, "return")?;
         let over_steps = |column: &str| optional_curves(evaluations, &task, &method, column);
         let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
         let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
@@ -252,13 +252,11 @@ impl Runs {
             let [low, high] = [low, high].map(|end| Some(end.clamp(-1.0, 1.0)));
             row.extend([("success_minus_sac_t_low", low), ("success_minus_sac_t_high", high)]);
         }
-        if !self.returns.is_empty() && !baseline.returns.is_empty() {
-            let (difference, [low, high]) = paired_difference(&self.returns, &baseline.returns, &mut stream());
-            let entries = ["return_minus_sac", "return_minus_sac_low", "return_minus_sac_high"];
-            row.extend(entries.into_iter().zip([difference, low, high].map(Some)));
-            if let Some(ends) = welch_interval(&means(&self.returns), &means(&baseline.returns)) {
-                row.extend(["return_minus_sac_t_low", "return_minus_sac_t_high"].into_iter().zip(ends.map(Some)));
-            }
+        let (difference, [low, high]) = paired_difference(&self.returns, &baseline.returns, &mut stream());
+        let entries = ["return_minus_sac", "return_minus_sac_low", "return_minus_sac_high"];
+        row.extend(entries.into_iter().zip([difference, low, high].map(Some)));
+        if let Some(ends) = welch_interval(&means(&self.returns), &means(&baseline.returns)) {
+            row.extend(["return_minus_sac_t_low", "return_minus_sac_t_high"].into_iter().zip(ends.map(Some)));
         }
         for (entries, (probability, [low, high])) in [
             (

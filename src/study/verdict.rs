@@ -60,10 +60,14 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
     }
     text += &format!(" {} told the reward function", are(&told));
     medians.retain(|(_, method)| uninformed.contains(method));
+    let known = informed.len() + uninformed.len() == learning.len();
+    let others = if known { "the methods that are not" } else { "those that are known not to be" };
     text += &match earliest(&medians) {
         _ if told.len() < first.len() || uninformed.is_empty() => ".".into(),
-        Some((steps, first)) => format!("; of the methods that are not, {} first, by step {steps:.0}.", are(&first)),
-        None => format!("; no method without it reaches {level:.0} % in its median seed."),
+        Some((steps, first)) => {
+            format!("; of {others}, {} first, by step {steps:.0}.", are(&first))
+        }
+        None => format!("; of {others}, none reaches {level:.0} % in its median seed."),
     };
     Ok(text)
 }

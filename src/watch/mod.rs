@@ -209,7 +209,8 @@ fn drawn_trajectories(env: &impl Env, trajectories: &[ImaginedTrajectory]) -> Ve
         value: round((f64::from(trajectory.value) - low) / (high - low).max(1e-9)),
         spread: trajectory.disagreement,
     });
-    drawn.filter(|path| path.points.iter().flatten().all(|x| x.is_finite())).collect()
+    let finite = |path: &Path3| path.points.iter().flatten().all(|x| x.is_finite());
+    drawn.filter(|path| !path.points.is_empty() && finite(path)).collect()
 }
 
 /// # Errors

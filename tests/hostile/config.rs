@@ -302,6 +302,8 @@ fn nothing_is_ignored() {
         ("pets", "agent = 'sac'", "`agent` cannot be changed, it is \"pets\"; choose another method by --method"),
         ("random", "steps = 100", "`steps` is 100, but random does not learn; leave it out"),
         ("pets", "base = 'sac'", "unknown field `base`"),
+        ("pets", "[pets]\nplanner = 'cem'", "`pets.planner`: a name alone is not enough: write `{ NAME = VALUE }`"),
+        ("pets", "[pets]\nrisk = 'cvar'", "`pets.risk`: a name alone is not enough"),
         ("pets", "[sac]\nbatch = 3", "[sac] is for another kind of agent; settings of this one stand in [pets]"),
         ("pets", "pets.ensemble.batch = -1", "`pets.ensemble.batch`: invalid value: integer `-1`"),
         ("pets", "[pets.ensemble]\nbatchh = 3", "`pets.ensemble`: unknown field `batchh` (did you mean `batch`?)"),

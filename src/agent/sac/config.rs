@@ -31,7 +31,7 @@ pub struct SacConfig {
     /// Target entropy in nats, for each number of an action: -1 gives the usual -dim(A).
     pub target_entropy: f32,
     /// Time steps for which each action is held: a decision. Transitions, the discount and n-step returns are of decisions; their
-    /// rewards are means.
+    /// rewards are means, with zeros after the end of the task.
     #[doc(alias = "frame skip")]
     pub action_repeat: usize,
     /// Transitions in a minibatch.

@@ -178,7 +178,7 @@ mod tests {
         }
     }
 
-    /// On the arm's tasks a transition whose goal was relabelled has the reward that the environment would have given.
+    /// Relabelling could not make both differences zero.
     #[test]
     fn a_goal_that_two_features_are_compared_with_is_refused() {
         let [by_hand, by_cube] =
@@ -189,6 +189,7 @@ mod tests {
         assert!(problem.to_string().contains("compares `goal` with both `hand` and `cube`"), "{problem}");
     }
 
+    /// On the arm's tasks a transition whose goal was relabelled has the reward that the environment would have given.
     #[test]
     fn tasks_with_goals_can_be_relabelled() {
         for task in [Task::Reach, Task::Push] {

@@ -18,7 +18,7 @@ pub struct TdMpc2Config {
     /// Steps that the model is rolled out for when it learns.
     pub horizon: usize,
     /// Time steps for which each action is held: a decision. The model's steps, and those of a plan, are decisions; their rewards
-    /// are means.
+    /// are means, with zeros after the end of the task.
     #[doc(alias = "frame skip")]
     pub action_repeat: usize,
     /// Updates for each time step; those of the warm-up are made up for at its end.

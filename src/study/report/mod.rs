@@ -139,7 +139,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
             } else {
                 ""
             },
-            if unknown.is_empty() { String::new() } else { format!("; of {}, it is not known", listed(&unknown)) },
+            if unknown.is_empty() { String::new() } else { format!("; for {}, this is not known", listed(&unknown)) },
         );
     }
     for difference in tables.differences_of_environments()? {

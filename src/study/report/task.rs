@@ -73,7 +73,7 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
     let mut text = String::new();
     for method in tables.methods(task)? {
         let value = |column: &str| tables.value(task, &method, column);
-        if tables.is_judged_by_return(task)? {
+        if value("steps")?.is_some() && tables.is_judged_by_return(task)? {
             text += &of_return(tables, task, &method)?;
             continue;
         }
@@ -119,12 +119,17 @@ fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
         })
     };
     let Some(mean) = value("return_mean")? else { return Ok(String::new()) };
-    let mut text = format!("- `{method}` has a mean test return of {mean:.1}{}.", interval("return_t")?);
+    let success = match 100.0 * value("success")?.unwrap_or(0.0) {
+        0.0 => String::new(),
+        success => format!(", and succeeds in {success:.0} % of the test episodes"),
+    };
+    let mut text = format!("- `{method}` has a mean test return of {mean:.1}{}{success}.", interval("return_t")?);
     if let Some(difference) = value("return_minus_sac")? {
+        let student = interval("return_minus_sac_t")?;
         text += &format!(
-            " From the same test starts, minus that of `{BASELINE}`: {difference:+.1}{}, t interval{}.",
+            " From the same test starts, minus that of `{BASELINE}`: {difference:+.1}{}{}.",
             interval("return_minus_sac")?,
-            interval("return_minus_sac_t")?
+            if student.is_empty() { student } else { format!(", t interval{student}") }
         );
     }
     Ok(text + "\n")

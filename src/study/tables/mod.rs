@@ -185,8 +185,8 @@ impl Tables {
         optional_curves(&self.evaluations, task, method, "return_mean").map_err(inside)
     }
 
-    /// True if no method succeeds in any evaluation of the task, so that reports compare returns instead; false if no returns were
-    /// recorded.
+    /// True if methods learn the task and none succeeds in any evaluation, so that reports compare returns instead; false if no returns
+    /// were recorded.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -194,12 +194,11 @@ impl Tables {
         if self.evaluations.column("return_mean").is_err() {
             return Ok(false);
         }
+        let mut curves = Vec::new();
         for method in self.methods(task)? {
-            if self.curves(task, &method)?.iter().flat_map(|(_, success)| success).any(|success| *success > 0.0) {
-                return Ok(false);
-            }
+            curves.extend(self.curves(task, &method)?);
         }
-        Ok(true)
+        Ok(!curves.is_empty() && curves.iter().flat_map(|(_, success)| success).all(|success| *success == 0.0))
     }
 
     /// Over environment steps, the seconds of training until each evaluation. Empty if the tables do not tell them.
