@@ -255,15 +255,16 @@ fn numbers_from_studies_are_quoted_as_they_are() {
             format!("| {name} | {success} | {steps} | {by} ({reaching} of {seeds}) | {ratio} | {sparc:.1} |"),
         ));
     }
-    let [seeds, reaching] =
-        ["seeds", "seeds_reaching_80"].map(|column| ["pets", "sac", "tdmpc2"].map(|method| push(method, column)));
-    assert_eq!((seeds, reaching), ([5.0; 3], [5.0, 5.0, 4.0]));
+    let [seeds, reaching] = ["seeds", "seeds_reaching_80"]
+        .map(|column| ["pets", "sac", "tdmpc2", "dreamer"].map(|method| push(method, column)));
+    assert_eq!((seeds, reaching), ([5.0; 4], [5.0, 5.0, 4.0, 5.0]));
     let difference = |method: &str| {
         let [low, high] =
             ["success_minus_sac_t_low", "success_minus_sac_t_high"].map(|column| 100.0 * push(method, column));
         format!("{low:.0} to {high:.0} percentage points")
     };
-    let differences = format!("from {} for PETS, and from {} for TD-MPC2", difference("pets"), difference("tdmpc2"));
+    let [pets, tdmpc2, dreamer] = ["pets", "tdmpc2", "dreamer"].map(difference);
+    let differences = format!("from {pets} for PETS, from {tdmpc2} for TD-MPC2, and from {dreamer} for Dreamer");
     quotes.push(("README.md", differences));
     assert_eq!(test_successes("push", "push", "sac"), [88, 92, 73, 95, 92]);
     let [times, low, high] = sac_steps_ratio("reach", "pets");
