@@ -139,6 +139,6 @@ impl StudyObserver for Progress {
         if let Some(bar) = &shown.bar {
             bar.finish_and_clear();
         }
-        self.bars.suspend(|| note(format_args!("{}: {problem}; the other runs go on", shown.name)));
+        self.bars.suspend(|| note(format_args!("{} failed: {problem}", shown.name)));
     }
 }

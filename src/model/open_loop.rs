@@ -82,7 +82,8 @@ pub trait OpenLoopModel {
 }
 
 /// Evaluates a model on held-out episodes of the environment with this `spec`, one row for each of the [`HORIZONS`] for which
-/// at least half of the episodes are long enough, and over which some feature moves differently from start to start; no rows without episodes.
+/// at least half of the episodes are long enough, and over which some feature moves differently from start to start; no rows
+/// without episodes.
 #[doc(alias = "open loop")]
 pub fn open_loop(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rng: &mut Rng) -> Vec<OpenLoop> {
     let mut lengths: Vec<usize> = episodes.iter().map(|episode| episode.actions.len()).collect();

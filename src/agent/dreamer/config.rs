@@ -22,8 +22,8 @@ pub struct DreamerConfig {
     pub planner: Option<PlannerConfig>,
     /// How often it replans, and how long each action is repeated.
     pub control: ControlConfig,
-    /// Time steps for which each action of the policy is held: a decision. The world model's steps, rewards (means, with zeros after the end of the task) and discount
-    /// are of decisions.
+    /// Time steps for which each action of the policy is held: a decision. The world model's steps, rewards (means, with zeros after
+    /// the end of the task) and discount are of decisions.
     #[doc(alias = "frame skip")]
     pub action_repeat: usize,
     /// Learning rate of all networks.

@@ -18,10 +18,10 @@ pub struct PetsConfig {
     /// How plans become control.
     pub control: ControlConfig,
     /// Time steps for which each action is held: a decision. The steps of the model, of plans and of the random actions' noise are
-    /// decisions, and so costs, penalties and disagreement count decisions. A learned reward is the mean over a decision, with zeros after the end of the task; a known
-    /// one is computed as if the decision were one time step. With k time steps, a plan over the same time takes 1/k of the
-    /// predictions, and the model has 1/k of the transitions to learn from. `control.action_repeat` holds planned actions, too,
-    /// but there the model predicts every time step.
+    /// decisions, and so costs, penalties and disagreement count decisions. A learned reward is the mean over a decision, with zeros
+    /// after the end of the task; a known one is computed as if the decision were one time step. With k time steps, a plan over the
+    /// same time takes 1/k of the predictions, and the model has 1/k of the transitions to learn from. `control.action_repeat` holds
+    /// planned actions, too, but there the model predicts every time step.
     #[doc(alias = "frame skip")]
     pub action_repeat: usize,
     /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.
