@@ -568,6 +568,55 @@ fn a_learned_reward_knows_goals_that_it_has_not_seen() {
     }
 }
 
+/// A point in a plane, seen along the axes from its goal only, and then along the diagonals. With the components of the way next to each
+/// other, a learned reward reads how long it is; with another feature in between, it has to infer that.
+#[test]
+fn a_learned_reward_knows_distances_in_directions_that_it_has_not_seen() {
+    let error = |order: [usize; 7]| {
+        let features = [
+            Feature::new("x"),
+            Feature::new("y"),
+            Feature::new("goal x").constant(),
+            Feature::new("goal y").constant(),
+            Feature::new("way x").difference("goal x", "x"),
+            Feature::new("way y").difference("goal y", "y"),
+            Feature::new("nothing").constant(),
+        ];
+        let spec = Spec::new("plane", order.map(|i| features[i].clone()), 2, 50, 0.1);
+        let observation = |[x, y]: [f32; 2]| {
+            let all = [0.0, 0.0, x, y, x, y, 0.0];
+            order.map(|i| all[i]).to_vec()
+        };
+        let mut rng = rng::stream(0, "directions");
+        let mut data = ReplayBuffer::new(7, 2, 2000);
+        for i in 0..2000 {
+            let distance = rng::uniform(&mut rng, -1.0, 1.0) as f32;
+            let obs = observation(if i % 2 == 0 { [distance, 0.0] } else { [0.0, distance] });
+            data.push(&Transition {
+                obs: obs.clone(),
+                action: vec![0.0; 2],
+                reward: -distance.abs(),
+                next_obs: obs,
+                terminated: false,
+                truncated: false,
+            });
+        }
+        let config = EnsembleConfig { learn_reward: true, reward_lasso: 10.0, ..config() };
+        let mut ensemble = Ensemble::new(&spec, config, &mut rng).expect("usable settings");
+        ensemble.fit(&data, &mut rng);
+        let dynamics = ensemble.dynamics();
+        let learned = dynamics.learned_reward().expect("a learned reward");
+        let ways = [[0.2, 0.2], [-0.4, 0.4], [0.5, -0.5], [-0.6, -0.6]];
+        let error = |way: [f32; 2]| {
+            let obs = observation(way);
+            (learned.reward(&obs, &[0.0; 2], &obs) + way[0].hypot(way[1])).abs()
+        };
+        ways.map(error).iter().sum::<f32>() / ways.len() as f32
+    };
+    let (read, inferred) = (error([0, 1, 2, 3, 4, 5, 6]), error([0, 1, 2, 3, 4, 6, 5]));
+    assert!(read < 0.5 * inferred, "mean error {read} with the length of the way, {inferred} without");
+}
+
 /// Two goals can be told apart by their places, and nothing in the data says that the next goal has the same reward around it.
 #[test]
 fn with_a_group_lasso_a_learned_reward_depends_on_differences_alone() {

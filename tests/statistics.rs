@@ -360,7 +360,7 @@ fn where_nothing_succeeds_returns_are_compared() {
     let report = report_in(folder.path());
     for part in [
         "Significantly higher test returns than `sac`: `pets`.",
-        "`pets` has a mean test return of -11.5 [-13.6, -9.4]. From the same test starts, minus that of `sac`: +10.0 [",
+        "`pets` has a mean test return of -11.5 (t interval [-13.6, -9.4]). Return from the same test starts, minus that of `sac`: +10.0 [",
     ] {
         assert!(report.contains(part), "no `{part}` in: {report}");
     }

@@ -58,7 +58,7 @@ pub use autoencoder::{Autoencoder, AutoencoderConfig};
 pub use differentiable::Differentiable;
 pub use dynamics::{Dynamics, Prediction};
 pub use ensemble::{Ensemble, EnsembleConfig, Fit, LearnedReward};
-pub use features::{Cube, FeatureMap, LatentFeatures, Normaliser};
+pub use features::{Cube, Distances, FeatureMap, LatentFeatures, Normaliser};
 pub use imagination::{Imagination, ImaginedReturns, Propagation, Reward, Value};
 pub use implicit::{EntropyBonus, ImplicitConfig, ImplicitLoss, ImplicitModel, PolicyPrior, Probe, Probed};
 pub use rssm::{Latent, Rssm, RssmConfig};

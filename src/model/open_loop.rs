@@ -310,7 +310,7 @@ mod tests {
         assert!(rows.is_empty(), "{rows:?}");
     }
 
-    /// One long episode among short ones would be the only one that is judged.
+    /// With one long episode among short ones, all start times would come from the long one.
     #[test]
     fn horizons_suit_half_of_the_episodes() {
         let spec = Spec::new("test", [Feature::new("x")], 1, 30, 0.1);

@@ -97,38 +97,36 @@ pub(super) fn listed(names: &[String]) -> String {
 /// three, 0.10.
 const SEEDS: f64 = 4.0;
 
+/// A comparison with the baseline, by an interval of a column of the summary.
+struct Comparison {
+    column: &'static str,
+    /// The value that means no difference.
+    equal: f64,
+    measure: String,
+    /// How much of the measure a method has whose interval lies above that value.
+    above: &'static str,
+    /// The same, below it.
+    below: &'static str,
+}
+
 /// How the other methods compare with the baseline. An interval is the wider of the bootstrap's and Student's at either end.
 fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result<Vec<String>> {
     let mut points = Vec::new();
     let level = 100.0 * LEVEL;
-    let of_return = (
-        "return_minus_sac",
-        0.0,
-        String::from("test returns"),
-        String::from("Significantly higher test returns than"),
-        String::from("Significantly lower test returns than"),
-        String::from("No significant difference in test returns from"),
-    );
-    let of_success = [
-        (
-            "sac_steps_ratio",
-            1.0,
-            format!("steps to {level:.0} %"),
-            format!("Significantly fewer steps to {level:.0} % than"),
-            format!("Significantly more steps to {level:.0} % than"),
-            format!("No significant difference in steps to {level:.0} % from"),
-        ),
-        (
-            "success_minus_sac",
-            0.0,
-            "test success".into(),
-            "Significantly more test success than".into(),
-            "Significantly less test success than".into(),
-            "No significant difference in test success from".into(),
-        ),
-    ];
-    let comparisons = if tables.is_judged_by_return(task)? { vec![of_return] } else { of_success.into() };
-    for (column, none, measure, better, worse, open) in comparisons {
+    let comparisons = if tables.is_judged_by_return(task)? {
+        let measure = "test returns".into();
+        vec![Comparison { column: "return_minus_sac", equal: 0.0, measure, above: "higher", below: "lower" }]
+    } else {
+        let steps = format!("steps to {level:.0} %");
+        let success = "test success".into();
+        vec![
+            Comparison { column: "sac_steps_ratio", equal: 1.0, measure: steps, above: "fewer", below: "more" },
+            Comparison { column: "success_minus_sac", equal: 0.0, measure: success, above: "more", below: "less" },
+        ]
+    };
+    for Comparison { column, equal, measure, above, below } in comparisons {
+        let [better, worse] = [above, below].map(|amount| format!("Significantly {amount} {measure} than"));
+        let open = format!("No significant difference in {measure} from");
         let late = format!("Not every seed reaches {level:.0} % within its budget, so there is no ratio of steps to");
         let at_once = format!("Some seeds are at {level:.0} % at step 0, so there is no ratio of steps to");
         let few = format!("Fewer than {SEEDS:.0} seeds of one of the two, too few to compare {measure} with");
@@ -144,8 +142,8 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
                 (None, None) if count(method, "seeds_reaching_80")? < count(method, "seeds")? => 3,
                 (None, None) => 4,
                 _ if count(method, "seeds")?.min(count(BASELINE, "seeds")?) < SEEDS => 5,
-                (Some(low), _) if low > none => 0,
-                (_, Some(high)) if high < none => 1,
+                (Some(low), _) if low > equal => 0,
+                (_, Some(high)) if high < equal => 1,
                 _ => 2,
             };
             groups[group].1.push(format!("`{method}`"));

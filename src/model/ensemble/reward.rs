@@ -1,9 +1,10 @@
 //! The reward, learned by networks of its own.
 //!
 //! A reward is a function of the transition, so its networks read observation, action and next observation, observations as
-//! [`LatentFeatures`]: displacements instead of goals, because a few hundred episodes contain only a few hundred goals. They
-//! share no weights with the networks of the dynamics, so that neither disturbs the other's training. There is one for each
-//! member of the ensemble; all learn from the same transitions, each in its own order.
+//! [`LatentFeatures`]: displacements instead of goals, because a few hundred episodes contain only a few hundred goals; and
+//! the lengths of displacements, [`Distances`]. They share no weights with the networks of the dynamics, so that neither
+//! disturbs the other's training. There is one for each member of the ensemble; all learn from the same transitions, each in
+//! its own order.
 
 use super::data::Data;
 use super::fit::{Fit, Split};
@@ -12,7 +13,7 @@ use super::{EnsembleConfig, MIN_STD};
 use crate::checkpoint::Weights;
 use crate::env::{KnownReward, Spec};
 use crate::error::Result;
-use crate::model::{LatentFeatures, Normaliser};
+use crate::model::{Distances, LatentFeatures, Normaliser};
 use crate::nn::GroupLasso;
 use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
 use crate::nn::two_hot::{symexp, symlog};
@@ -38,7 +39,8 @@ pub(super) struct RewardModel {
 
 impl RewardModel {
     pub fn new(spec: &Spec, config: &EnsembleConfig, rng: &mut Rng) -> Self {
-        let inputs = Inputs { features: LatentFeatures::new(spec), actions: spec.action_size };
+        let inputs =
+            Inputs { features: LatentFeatures::new(spec), distances: Distances::new(spec), actions: spec.action_size };
         let mut networks = Networks::new(config, [inputs.width(), 1], &config.reward_hidden, false, rng);
         networks.lasso = inputs.lasso(config.reward_lasso);
         Self { networks, inputs, unit: config.reward_unit, range: [0.0; 2] }
@@ -107,25 +109,33 @@ impl RewardModel {
 #[derive(Clone, Debug)]
 struct Inputs {
     features: LatentFeatures,
+    distances: Distances,
     actions: usize,
 }
 
 impl Inputs {
     fn width(&self) -> usize {
-        2 * self.features.width() + self.actions
+        2 * (self.features.width() + self.distances.width()) + self.actions
     }
 
     /// The group lasso of [`EnsembleConfig::reward_lasso`].
     fn lasso(&self, coefficient: f32) -> Option<GroupLasso> {
-        let features = self.features.lasso(coefficient)?;
-        Some(GroupLasso { coefficients: [&features[..], &vec![coefficient; self.actions], &features].concat() })
+        let mut of_observation = self.features.lasso(coefficient)?;
+        of_observation.resize(of_observation.len() + self.distances.width(), 0.0);
+        let of_action = vec![coefficient; self.actions];
+        Some(GroupLasso { coefficients: [&of_observation[..], &of_action, &of_observation].concat() })
     }
 
     /// Appends the inputs of a transition: observation, action, next observation.
     fn push(&self, [obs, action, next_obs]: [&[f32]; 3], inputs: &mut Vec<f32>) {
-        self.features.push(obs, inputs);
+        self.push_observation(obs, inputs);
         inputs.extend_from_slice(action);
-        self.features.push(next_obs, inputs);
+        self.push_observation(next_obs, inputs);
+    }
+
+    fn push_observation(&self, obs: &[f32], inputs: &mut Vec<f32>) {
+        self.features.push(obs, inputs);
+        self.distances.push(obs, inputs);
     }
 }
 

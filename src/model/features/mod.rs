@@ -3,7 +3,8 @@
 //! [`FeatureMap`] serves the ensembles, [`LatentFeatures`] the latent models (autoencoder and RSSM). Both read the
 //! [`crate::env::Role`] of each feature: `Dynamic` features are predicted, `Constant` ones (a goal) are not, and a
 //! `Difference` is recomputed from the two features that it is the difference of. [`Cube`] reduces the orientation of a
-//! cube by its 24 rotational symmetries, and [`Normaliser`] standardises inputs and targets.
+//! cube by its 24 rotational symmetries, [`Distances`] are the lengths of displacement vectors, and [`Normaliser`]
+//! standardises inputs and targets.
 //!
 //! ```
 //! use handful::model::features::FeatureMap;
@@ -22,11 +23,13 @@
 //! ```
 
 mod cube;
+mod distances;
 mod feature_map;
 mod latent;
 mod normaliser;
 
 pub use cube::Cube;
+pub use distances::Distances;
 pub use feature_map::FeatureMap;
 pub use latent::LatentFeatures;
 pub use normaliser::Normaliser;

@@ -13,12 +13,14 @@ use crate::error::Result;
 /// # Errors
 /// If the tables lack a column or a file cannot be written.
 pub(super) fn section(tables: &Tables, task: &str, differ: bool, replays: &[Replay], to: &Path) -> Result<String> {
-    let mut text = format!("\n## {task}\n\n{}{}", findings(tables, task)?, evaluations(tables, task, differ)?);
+    let by_return = tables.is_judged_by_return(task)?;
+    let mut text =
+        format!("\n## {task}\n\n{}{}", findings(tables, task, by_return)?, evaluations(tables, task, differ)?);
     text += &details(tables, task)?;
     let mut figure = |file: String, caption: &str| text += &format!("\n![{caption}]({file})\n");
     let file = format!("{task}-learning.svg");
     if figures::learning_curves(tables, task, &to.join(&file))? {
-        let what = if tables.is_judged_by_return(task)? { "Return (no evaluation succeeds)" } else { "Success rate" };
+        let what = if by_return { "Return (no evaluation succeeds)" } else { "Success rate" };
         figure(
             file,
             &format!(
@@ -68,12 +70,12 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
     Ok(format!("\n<details><summary>Model and values of <code>{method}</code></summary>\n\n{text}</details>\n"))
 }
 
-/// The results of a task in words.
-fn findings(tables: &Tables, task: &str) -> Result<String> {
+/// The results of a task in words: the returns of methods that learn it, if no evaluation succeeds, and success rates else.
+fn findings(tables: &Tables, task: &str, by_return: bool) -> Result<String> {
     let mut text = String::new();
     for method in tables.methods(task)? {
         let value = |column: &str| tables.value(task, &method, column);
-        if value("steps")?.is_some() && tables.is_judged_by_return(task)? {
+        if by_return && value("steps")?.is_some() {
             text += &of_return(tables, task, &method)?;
             continue;
         }
@@ -112,27 +114,18 @@ fn findings(tables: &Tables, task: &str) -> Result<String> {
 /// The returns of a method in words, on a task where no evaluation succeeds.
 fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
     let value = |column: &str| tables.value(task, method, column);
-    let interval = |column: &str| -> Result<String> {
-        Ok(match (value(&format!("{column}_low"))?, value(&format!("{column}_high"))?) {
-            (Some(low), Some(high)) => format!(" [{low:.1}, {high:.1}]"),
-            _ => String::new(),
-        })
-    };
     let Some(mean) = value("return_mean")? else { return Ok(String::new()) };
+    let student = match (value("return_t_low")?, value("return_t_high")?) {
+        (Some(low), Some(high)) => format!(" (t interval [{low:.1}, {high:.1}])"),
+        _ => String::new(),
+    };
     let success = match 100.0 * value("success")?.unwrap_or(0.0) {
         0.0 => String::new(),
         success => format!(", and succeeds in {success:.0} % of the test episodes"),
     };
-    let mut text = format!("- `{method}` has a mean test return of {mean:.1}{}{success}.", interval("return_t")?);
-    if let Some(difference) = value("return_minus_sac")? {
-        let student = interval("return_minus_sac_t")?;
-        text += &format!(
-            " From the same test starts, minus that of `{BASELINE}`: {difference:+.1}{}{}.",
-            interval("return_minus_sac")?,
-            if student.is_empty() { student } else { format!(", t interval{student}") }
-        );
-    }
-    Ok(text + "\n")
+    let measure = ("Return", "return_minus_sac", "");
+    let difference = difference(tables, task, method, measure, |x| format!("{:+.1}", x + 0.0))?;
+    Ok(format!("- `{method}` has a mean test return of {mean:.1}{student}{success}.{difference}\n"))
 }
 
 /// The numbers of the methods that learn a task which the first table has no room for.
@@ -178,25 +171,8 @@ fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<Str
     let value = |column: &str| tables.value(task, method, column);
     let ends =
         |column: &str| -> Result<_> { Ok((value(&format!("{column}_low"))?, value(&format!("{column}_high"))?)) };
-    let (Some(difference), (Some(low), Some(high))) = (value("success_minus_sac")?, ends("success_minus_sac")?) else {
-        return Ok(String::new());
-    };
-    let mut text = if low < high {
-        let [difference, low, high] = [difference, low, high].map(|share| 100.0 * share);
-        format!(
-            " Success from the same test starts, minus that of `{BASELINE}`: {difference:+.0} percentage points [{low:+.0}, {high:+.0}]{}.",
-            match ends("success_minus_sac_t")? {
-                (Some(low), Some(high)) => format!(", t interval [{:+.0}, {:+.0}]", 100.0 * low, 100.0 * high),
-                _ => String::new(),
-            }
-        )
-    } else {
-        format!(
-            " Success from the same test starts, minus that of `{BASELINE}`: {:+.0} percentage points, without an interval: resampling \
-             shows no spread.",
-            (100.0 * difference).round() + 0.0
-        )
-    };
+    let measure = ("Success", "success_minus_sac", " percentage points");
+    let mut text = difference(tables, task, method, measure, |share| format!("{:+.0}", (100.0 * share).round() + 0.0))?;
     let level = 100.0 * LEVEL;
     match (value("sac_steps_ratio")?, ends("sac_steps_ratio")?) {
         (Some(ratio), (Some(low), Some(high))) => {
@@ -217,6 +193,28 @@ fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<Str
         _ => {}
     }
     Ok(text)
+}
+
+/// The difference between a method and [`BASELINE`] in a measure of the test, with its intervals; nothing if one of them does not learn
+/// the task.
+fn difference(
+    tables: &Tables,
+    task: &str,
+    method: &str,
+    (measure, column, unit): (&str, &str, &str),
+    text: impl Fn(f64) -> String,
+) -> Result<String> {
+    let entry = |name: &str| tables.value(task, method, &format!("{column}{name}"));
+    let (Some(difference), Some(low), Some(high)) = (entry("")?, entry("_low")?, entry("_high")?) else {
+        return Ok(String::new());
+    };
+    let [value, from, to] = [difference, low, high].map(&text);
+    let intervals = match (entry("_t_low")?, entry("_t_high")?) {
+        _ if low >= high => ", without an interval: resampling shows no spread".into(),
+        (Some(low), Some(high)) => format!(" [{from}, {to}], t interval [{}, {}]", text(low), text(high)),
+        _ => format!(" [{from}, {to}]"),
+    };
+    Ok(format!(" {measure} from the same test starts, minus that of `{BASELINE}`: {value}{unit}{intervals}."))
 }
 
 /// How often the methods that learn a task were evaluated; a warning if not all alike.
