@@ -125,6 +125,7 @@ fn tdmpc2_swings_the_pendulum_up() {
 }
 
 /// The agent earns more than `least` per episode, and its model predicts the pendulum five steps ahead.
+#[track_caller]
 fn assert_swings_up(agent: &mut (impl Agent + Diagnostics), least: f64) {
     let mut evaluator = Evaluator::new(|| Ok(Task::Pendulum.make())).expect("a pendulum");
     let evaluation = evaluator.evaluate(agent, 20, EvalSeeds::Test).expect("valid actions");

@@ -288,6 +288,16 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("chapters/11-tdmpc2.md", tdmpc2),
         ("README.md", learned),
     ]);
+    let [times, low, high] = sac_steps_ratio("reach", "pets-learned");
+    let interval = format!("t interval from {low:.1} to {high:.1}");
+    assert!(mean("pets-learned") < mean("sac") && mean("sac") < mean("tdmpc2").min(mean("dreamer")));
+    let successes = test_successes("reach", "reach", "pets-learned").iter().sum::<usize>();
+    quotes.extend([
+        ("README.md", format!("SAC needs {times:.1} times as many on average ({interval}")),
+        ("chapters/00-start.md", format!("on this easy task ({:.0})", mean("pets-learned"))),
+        ("chapters/06-pets.md", format!("this agent succeeds in {successes} of 500 test episodes")),
+        ("chapters/12-study.md", format!("fewer steps than SAC by the bootstrap only ({interval})")),
+    ]);
     assert_eq!(test_successes("reach", "reach", "pets"), [100; 5]);
     quotes.push(("chapters/06-pets.md", "each succeeds in all of its 100 test episodes after 3,000".into()));
     let sac = 500.0 * first("sac", "success");

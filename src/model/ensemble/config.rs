@@ -64,9 +64,10 @@ pub struct EnsembleConfig {
     #[doc(alias = "symlog")]
     pub reward_unit: f32,
     /// Group lasso on the inputs of the networks that learn the reward, except differences, such as the vector from the hand to
-    /// a goal, and [distances](crate::model::Distances): each step shortens the weights that leave an input, as one vector, by `learning_rate * reward_lasso`. Without
-    /// it, networks tell a few episodes apart by what is constant in each, such as the place of the goal, and are wrong in
-    /// the next one. It has no effect where no feature is a [difference](crate::env::Feature::difference).
+    /// a goal, and [distances](crate::model::Distances): each step shortens the weights that leave an input, as one vector, by
+    /// `learning_rate * reward_lasso`. Without it, networks tell a few episodes apart by what is constant in each, such as the
+    /// place of the goal, and are wrong in the next one. It has no effect where no feature is a
+    /// [difference](crate::env::Feature::difference).
     #[doc(alias = "group lasso")]
     pub reward_lasso: f32,
     /// Whether each predicted change is multiplied by a learned gate, a sigmoid with its own output, which can close over

@@ -9,12 +9,13 @@ use crate::nn::two_hot::symlog;
 
 /// The distances in an observation, such as that from the hand to a cube: the lengths of its displacement vectors.
 ///
-/// The components of a vector are consecutive features of [`Role::Difference`] whose minuends, and whose subtrahends, are
-/// consecutive, too. Many rewards depend on distances alone. A network that reads only the components has to learn the
-/// length of a vector from the directions in its data, and with one goal in an episode there are few of them.
+/// The components of a vector are consecutive features of [`Role::Difference`] with one scale whose minuends, and whose
+/// subtrahends, are consecutive, too (and none is both). A difference on its own is a vector of one component. Many rewards
+/// depend on distances alone. A network that reads only the components has to learn the length of a vector from the directions
+/// in its data, and with one goal in an episode there are few of them.
 ///
-/// As [`LatentFeatures`](super::LatentFeatures) do with differences, networks read each distance, in units of the scale of its
-/// components (the largest), through symlog, and a second time through a tanh.
+/// As [`LatentFeatures`](super::LatentFeatures) do with differences, the networks of a learned reward read each distance, in
+/// units of its scale, through symlog, and a second time through a tanh.
 #[derive(Clone, Debug)]
 pub struct Distances {
     /// For each vector, the indices of its components, and its scale.
@@ -25,19 +26,24 @@ impl Distances {
     /// The distances in an environment's observations.
     pub fn new(spec: &Spec) -> Self {
         let mut vectors: Vec<(Range<usize>, f32)> = Vec::new();
-        // The feature, its minuend and its subtrahend that would be the next component of the last vector.
-        let mut next = None;
+        // Minuend and subtrahend of the last vector's first component.
+        let mut first = [0; 2];
         for (i, feature) in spec.observation.iter().enumerate() {
             let Role::Difference { minuend, subtrahend } = &feature.role else { continue };
             let (Some(a), Some(b)) = (spec.index_of(minuend), spec.index_of(subtrahend)) else { continue };
+            let continues = |components: &Range<usize>, scale: f32| {
+                let [a0, b0] = first;
+                let consecutive = i == components.end && [a, b] == [a0, b0].map(|index| index + components.len());
+                // Otherwise a chain of pairs, from A to B and from B to C, would be one vector.
+                consecutive && (a < b0 || b < a0) && scale == feature.scale
+            };
             match vectors.last_mut() {
-                Some((components, scale)) if next == Some([i, a, b]) => {
-                    components.end = i + 1;
-                    *scale = scale.max(feature.scale);
+                Some((components, scale)) if continues(components, *scale) => components.end += 1,
+                _ => {
+                    vectors.push((i..i + 1, feature.scale));
+                    first = [a, b];
                 }
-                _ => vectors.push((i..i + 1, feature.scale)),
             }
-            next = Some([i + 1, a + 1, b + 1]);
         }
         Self { vectors }
     }
@@ -60,18 +66,52 @@ impl Distances {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::env::{Env, Task};
+    use crate::env::{Env, Feature, Task};
+
+    fn vectors(spec: &Spec) -> Vec<Vec<&str>> {
+        let names = |range: &Range<usize>| spec.observation[range.clone()].iter().map(|f| f.name.as_str()).collect();
+        Distances::new(spec).vectors.iter().map(|(range, _)| names(range)).collect()
+    }
 
     #[test]
     fn components_of_one_pair_of_places_are_one_vector() {
-        let components = |task: Task| -> Vec<Vec<String>> {
-            let world = task.make();
-            let names = |range: &Range<usize>| world.spec().observation[range.clone()].iter().map(|f| f.name.clone());
-            Distances::new(world.spec()).vectors.iter().map(|(range, _)| names(range).collect()).collect()
+        let names = |pairs: &[&str]| -> Vec<[String; 3]> {
+            pairs.iter().map(|pair| ["x", "y", "z"].map(|axis| format!("{pair} {axis}"))).collect()
         };
-        let vector = |name: &str| ["x", "y", "z"].map(|axis| format!("{name} {axis}")).to_vec();
-        assert_eq!(components(Task::Push), [vector("hand to cube"), vector("cube to goal")]);
-        assert_eq!(components(Task::Pendulum), [[""; 0]; 0]);
+        for (task, pairs) in [
+            (Task::Push, &["hand to cube", "cube to goal"][..]),
+            (Task::Stack, &["hand to cube", "cube to base"]),
+            (Task::Door, &["hand to door", "hand to handle"]),
+            (Task::Pendulum, &[]),
+        ] {
+            assert_eq!(vectors(task.make().spec()), names(pairs), "{}", task.name());
+        }
+    }
+
+    /// Places declared one after the other, and the ways from each to the next; places and velocities.
+    #[test]
+    fn adjacent_vectors_stay_apart() {
+        let feature = |name: &str| Feature::new(name);
+        let places = ["hand x", "hand y", "puck x", "puck y", "goal x", "goal y"].map(feature);
+        let way = |name: &str, to: &str, from: &str| feature(name).difference(to, from);
+        let ways = [
+            way("x to puck", "puck x", "hand x"),
+            way("y to puck", "puck y", "hand y"),
+            way("x to goal", "goal x", "puck x"),
+            way("y to goal", "goal y", "puck y"),
+        ];
+        let chain = Spec::new("chain", places.into_iter().chain(ways), 2, 50, 0.1);
+        assert_eq!(vectors(&chain), [["x to puck", "y to puck"], ["x to goal", "y to goal"]]);
+
+        let moving = [
+            feature("x"),
+            feature("v").around(0.0, 0.2),
+            feature("other x"),
+            feature("other v").around(0.0, 0.2),
+            way("way", "other x", "x"),
+            way("speed", "other v", "v").around(0.0, 0.2),
+        ];
+        assert_eq!(vectors(&Spec::new("moving", moving, 1, 50, 0.1)), [["way"], ["speed"]]);
     }
 
     #[test]

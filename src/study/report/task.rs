@@ -70,7 +70,7 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
     Ok(format!("\n<details><summary>Model and values of <code>{method}</code></summary>\n\n{text}</details>\n"))
 }
 
-/// The results of a task in words: the returns of methods that learn it, if no evaluation succeeds, and success rates else.
+/// The results of a task in words: the returns of methods that learn it, if no evaluation succeeds, and success rates otherwise.
 fn findings(tables: &Tables, task: &str, by_return: bool) -> Result<String> {
     let mut text = String::new();
     for method in tables.methods(task)? {
@@ -124,7 +124,7 @@ fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
         success => format!(", and succeeds in {success:.0} % of the test episodes"),
     };
     let measure = ("Return", "return_minus_sac", "");
-    let difference = difference(tables, task, method, measure, |x| format!("{:+.1}", x + 0.0))?;
+    let difference = difference(tables, task, method, measure, |x| format!("{:+.1}", (10.0 * x).round() / 10.0 + 0.0))?;
     Ok(format!("- `{method}` has a mean test return of {mean:.1}{student}{success}.{difference}\n"))
 }
 
