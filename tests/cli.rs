@@ -317,6 +317,22 @@ fn train_evaluate_and_watch() {
     refused(here, &changed("wider.toml"), &["weights.safetensors", "has the sizes", "are expected"]);
     refused(here, &changed("wrong.toml"), &["wrong.toml", "action_repeats"]);
 
+    // What was exported acts as the run does, but for rounding; the run itself stays as it is.
+    let size = |run: &str| std::fs::metadata(here.join(run).join("weights.safetensors")).expect("weights").len();
+    let before = size("run");
+    for _ in 0..2 {
+        let output = handful(here, &["export", "--run", "run", "--out", "small"]);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+    }
+    assert!(10 * size("small") < 6 * before && size("run") == before, "{} of {before} bytes", size("small"));
+    let output = handful(here, &["evaluate", "--run", "small", "--episodes", "3", "--seed", "0", "--json"]);
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let exported = summary["return_mean"].as_f64().expect("a number");
+    assert!((exported - returns[2]).abs() < 0.1 * returns[2].abs(), "{exported} and {}", returns[2]);
+    refused(here, &["export", "--run", "run", "--out", "run"], &["run", "choose another --out"]);
+    refused(here, &["export", "--run", "short", "--out", "small"], &["small", "another run (its `"]);
+    refused(here, &["export", "--run", "nowhere", "--out", "small"], &["nowhere", "there is no run"]);
+
     let output = handful(here, &["watch", "--run", "run", "--seed", "2"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     let page = std::fs::read_to_string(here.join("run/watch.html")).expect("a page");

@@ -577,7 +577,7 @@ fn a_learned_reward_knows_goals_that_it_has_not_seen() {
 /// is the distance along the axes only.
 #[test]
 fn a_learned_reward_knows_distances_in_directions_that_it_has_not_seen() {
-    let error = |order: [usize; 7]| {
+    let mean_error = |order: [usize; 7]| {
         let features = [
             Feature::new("x"),
             Feature::new("y"),
@@ -618,7 +618,7 @@ fn a_learned_reward_knows_distances_in_directions_that_it_has_not_seen() {
         };
         ways.map(error).iter().sum::<f32>() / ways.len() as f32
     };
-    let (read, inferred) = (error([0, 1, 2, 3, 4, 5, 6]), error([0, 1, 2, 3, 4, 6, 5]));
+    let (read, inferred) = (mean_error([0, 1, 2, 3, 4, 5, 6]), mean_error([0, 1, 2, 3, 4, 6, 5]));
     assert!(read < 0.1 && read < 0.5 * inferred, "mean error {read} with the length of the way, {inferred} without");
 }
 

@@ -1,9 +1,13 @@
 //! Checkpoints as files: safetensors, with a checksum.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use safetensors::View;
+use safetensors::tensor::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 
 use super::Weights;
@@ -13,6 +17,49 @@ use crate::files;
 /// The one entry of a file's metadata, an [`Envelope`] in JSON. (Several entries would be written in random order, and two
 /// equal checkpoints would be two different files.)
 const ENVELOPE: &str = "handful";
+
+/// An array as it is stored.
+struct Tensor<'a> {
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Cow<'a, [u8]>,
+}
+
+impl<'a> Tensor<'a> {
+    /// In half precision if that is exact.
+    fn of_numbers(numbers: &'a [f32], shape: [usize; 3]) -> Self {
+        let exact = |x: &f32| f16::from_f32(*x).to_f32().to_bits() == x.to_bits();
+        let (dtype, bytes) = if numbers.iter().all(exact) {
+            let bytes = numbers.iter().flat_map(|x| f16::from_f32(*x).to_ne_bytes()).collect();
+            (Dtype::F16, Cow::Owned(bytes))
+        } else {
+            (Dtype::F32, Cow::Borrowed(bytemuck::cast_slice(numbers)))
+        };
+        Self { dtype, shape: shape.to_vec(), bytes }
+    }
+
+    fn of_counts(counts: &'a [u64]) -> Self {
+        Self { dtype: Dtype::U64, shape: vec![counts.len()], bytes: Cow::Borrowed(bytemuck::cast_slice(counts)) }
+    }
+}
+
+impl View for Tensor<'_> {
+    fn dtype(&self) -> Dtype {
+        self.dtype
+    }
+
+    fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(&self.bytes)
+    }
+
+    fn data_len(&self) -> usize {
+        self.bytes.len()
+    }
+}
 
 /// What a file says about its arrays.
 #[derive(Serialize, Deserialize)]
@@ -54,14 +101,8 @@ impl Weights {
     /// # Errors
     /// If the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<()> {
-        let arrays = self.arrays.iter().map(|(name, (numbers, shape))| {
-            let view = TensorView::new(Dtype::F32, shape.to_vec(), bytemuck::cast_slice(numbers));
-            (name, view.expect("shapes were checked when the array came in"))
-        });
-        let counts = self.counts.iter().map(|(name, counts)| {
-            let view = TensorView::new(Dtype::U64, vec![counts.len()], bytemuck::cast_slice(counts));
-            (name, view.expect("one number each"))
-        });
+        let arrays = self.arrays.iter().map(|(name, (numbers, shape))| (name, Tensor::of_numbers(numbers, *shape)));
+        let counts = self.counts.iter().map(|(name, counts)| (name, Tensor::of_counts(counts)));
         let envelope = Envelope { checksum: self.checksum(), notes: self.notes.clone() };
         let envelope = serde_json::to_string(&envelope).expect("numbers and texts are JSON");
         let metadata = HashMap::from([(ENVELOPE.into(), envelope)]);
@@ -74,7 +115,7 @@ impl Weights {
     /// Reads a safetensors file.
     ///
     /// # Errors
-    /// If it cannot be read, is damaged, or holds NaN or anything but f32 arrays of three dimensions and u64 arrays of one.
+    /// If it cannot be read, is damaged, or holds NaN or anything but f32 and f16 arrays of three dimensions and u64 arrays of one.
     pub fn read(path: &Path) -> Result<Self> {
         let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
         let damaged = |problem: Cause| {
@@ -88,6 +129,10 @@ impl Weights {
             match (view.dtype(), view.shape()) {
                 (Dtype::F32, &[members, rows, columns]) => {
                     weights.insert(name, bytemuck::pod_collect_to_vec(view.data()), [members, rows, columns]);
+                }
+                (Dtype::F16, &[members, rows, columns]) => {
+                    let halves: Vec<f16> = bytemuck::pod_collect_to_vec(view.data());
+                    weights.insert(name, halves.to_f32_vec(), [members, rows, columns]);
                 }
                 (Dtype::U64, &[_]) => {
                     weights.counts.insert(name, bytemuck::pod_collect_to_vec(view.data()));
@@ -118,6 +163,8 @@ impl Weights {
 
 #[cfg(test)]
 mod tests {
+    use safetensors::tensor::TensorView;
+
     use super::*;
 
     /// As the first version wrote it, through a file.
@@ -148,7 +195,8 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("state.safetensors");
         let mut saved = Weights::default();
-        saved.insert("policy.bias", vec![0.5, -0.5], [1, 1, 2]);
+        saved.insert("policy.bias", vec![0.5, 0.1], [1, 1, 2]);
+        saved.insert("policy.half", vec![0.5, -0.25], [1, 2, 1]);
         saved.insert_counts("steps", &[1000]);
         saved.set_note("progress", "step = 1000".into());
         saved.write(&path).expect("a writable folder");
@@ -167,6 +215,31 @@ mod tests {
         for length in 0..whole.len() {
             std::fs::write(&path, &whole[..length]).expect("a writable folder");
             Weights::read(&path).expect_err("a part is not the whole");
+        }
+    }
+
+    /// Every number that is exact in half precision comes back as it was; what is not exact is not stored in it.
+    #[test]
+    fn half_precision_loses_nothing() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("state.safetensors");
+        let finite = (0..=u16::MAX).map(f16::from_bits).filter(|x| x.is_finite());
+        let halves: Vec<f32> = finite.map(f32::from).collect();
+        let shape = [1, halves.len(), 1];
+        let mut weights = Weights::default();
+        let mut write = |numbers: &[f32]| {
+            weights.insert("numbers", numbers.to_vec(), shape);
+            weights.write(&path).expect("a writable folder");
+            let read = Weights::read(&path).expect("what was just written");
+            let bits = |numbers: &[f32]| numbers.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(read.get("numbers", shape).expect("the numbers")), bits(numbers));
+            path.metadata().expect("a file").len()
+        };
+        let small = write(&halves);
+        for inexact in [0.1, 1e-9, 1e6, f32::MIN_POSITIVE] {
+            let mut numbers = halves.clone();
+            numbers[7] = inexact;
+            assert!(write(&numbers) > small + halves.len() as u64, "{inexact}");
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! A checkpoint holds f32 arrays (weights, optimiser moments, replayed experience), u64 arrays (step counts, the states of
 //! random number generators), and notes. The file's metadata have the notes and a checksum of everything in the file, so that
-//! damage is found when it is read.
+//! damage is found when it is read. An array whose numbers are all exact in half precision is stored in it.
 //!
 //! ```
 //! use handful::checkpoint::Weights;
@@ -28,6 +28,9 @@ mod file;
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
+
+use half::f16;
+use half::slice::HalfFloatSliceExt;
 
 use crate::error::{Error, Result};
 use crate::rng::{self, Rng};
@@ -86,6 +89,17 @@ impl Weights {
     pub fn shape(&self, name: &str) -> Result<[usize; 3]> {
         let found = self.arrays.get(name).map(|(_, shape)| *shape);
         found.ok_or_else(|| Error::Config(format!("the weights have no `{name}`")))
+    }
+
+    /// Rounds matrices (arrays of more than one row) to half precision, so that their file is half as large. Arrays of one row
+    /// (biases, the constants of a normalisation) stay as they are, and so do matrices with numbers beyond the range of f16.
+    pub fn round_to_half(&mut self) {
+        for (numbers, [_, rows, _]) in self.arrays.values_mut() {
+            let halves: Vec<f16> = numbers.iter().map(|x| f16::from_f32(*x)).collect();
+            if *rows > 1 && halves.iter().all(|x| x.is_finite()) {
+                *numbers = halves.to_f32_vec();
+            }
+        }
     }
 
     /// The name of an array that holds NaN, if there is one.
@@ -224,6 +238,20 @@ mod tests {
         other.insert("steps", vec![0.25], [1, 1, 1]);
         weights.absorb("", &other);
         assert!(weights == other && !weights.is_empty());
+    }
+
+    #[test]
+    fn only_matrices_are_rounded() {
+        let mut weights = Weights::default();
+        weights.insert("weight", vec![0.1, 1e-9, -3.0, 0.0], [1, 2, 2]);
+        weights.insert("bias", vec![0.1, 1e-9], [2, 1, 1]);
+        weights.insert("large", vec![0.1, 1e6], [1, 2, 1]);
+        weights.round_to_half();
+        let rounded = weights.get("weight", [1, 2, 2]).expect("the matrix");
+        assert!((rounded[0] - 0.1).abs() < 0.1 / 2048.0 && rounded[0] != 0.1, "{rounded:?}");
+        assert_eq!(rounded[1..], [0.0, -3.0, 0.0]);
+        assert_eq!(weights.get("bias", [2, 1, 1]).expect("the bias"), [0.1, 1e-9]);
+        assert_eq!(weights.get("large", [1, 2, 1]).expect("the matrix"), [0.1, 1e6]);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! The program `handful` is this with [`Registry::standard`]; a program of one's own registers more and calls [`main`].
 
 mod evaluate;
+mod export;
 mod output;
 mod progress;
 mod report;
@@ -43,6 +44,8 @@ enum Command {
     Train(train::Args),
     /// Test a trained agent.
     Evaluate(evaluate::Args),
+    /// Write a run's settings and weights, the latter in half precision, to share them.
+    Export(export::Args),
     /// Make tables, figures and report.md anew from a study's CSV files.
     Report(report::Args),
     /// Write an episode as one HTML file with a 3D replay.
@@ -76,6 +79,7 @@ pub fn main(registry: &Registry) -> ExitCode {
         Some(Command::Study(args)) => study::run(registry, args),
         Some(Command::Train(args)) => train::run(registry, args),
         Some(Command::Evaluate(args)) => end_on_ctrl_c().and_then(|()| evaluate::run(registry, &args)),
+        Some(Command::Export(args)) => end_on_ctrl_c().and_then(|()| export::run(&args)),
         Some(Command::Report(args)) => end_on_ctrl_c().and_then(|()| report::run(&args)),
         Some(Command::Watch(args)) => end_on_ctrl_c().and_then(|()| watch::run(registry, &args)),
     });

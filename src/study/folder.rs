@@ -231,11 +231,19 @@ pub(super) fn read_config(folder: &Path) -> Result<(PathBuf, RunConfig)> {
     Ok((path, config))
 }
 
-/// What the run in a folder has learned, for its method to act with.
+/// Gives a method what the run in a folder has learned.
 ///
 /// # Errors
 /// If the weights are missing, damaged, or those of another run.
 pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Method) -> Result<()> {
+    let (path, weights) = read_weights(folder, config)?;
+    let loaded = method.checkpoint_mut().load_weights(&weights);
+    loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))
+}
+
+/// # Errors
+/// If the weights are missing, damaged, or those of another run.
+fn read_weights(folder: &Path, config: &RunConfig) -> Result<(PathBuf, Weights)> {
     let path = folder.join(WEIGHTS);
     if !path.exists() {
         let advice = "the run has saved no weights yet; let it train for longer";
@@ -250,8 +258,35 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
     })?;
     check_own(&weights, &path, config)?;
     check_saved(&weights, &path)?;
-    let loaded = method.checkpoint_mut().load_weights(&weights);
-    loaded.map_err(|problem| Error::checkpoint(&path, problem.to_string(), Some(problem.into())))
+    Ok((path, weights))
+}
+
+/// Writes what is needed to act as the run in `folder` has learned to, into the folder `out`: its configuration, and its weights,
+/// with matrices in half precision ([`Weights::round_to_half`]). Returns the size of the weights' file in bytes.
+///
+/// # Errors
+/// If the run has no weights, or they are damaged; if `out` holds another run, or a run that can be resumed; or if a file cannot be
+/// written.
+pub fn export(folder: &Path, out: &Path) -> Result<u64> {
+    let (_, config) = read_config(folder)?;
+    if !config.learns() {
+        return Err(Error::Config(format!(
+            "{}: {} learns nothing; there are no weights",
+            folder.display(),
+            config.method
+        )));
+    }
+    let (_, mut weights) = read_weights(folder, &config)?;
+    check_run(out, &config)?;
+    if out.join(CHECKPOINT).exists() {
+        let advice = "its weights belong to its checkpoint; choose another --out";
+        return Err(Error::Config(format!("{}: this folder holds a run, and {advice}", out.display())));
+    }
+    weights.round_to_half();
+    let path = out.join(WEIGHTS);
+    files::write(&out.join(CONFIG), config.to_toml().as_bytes())?;
+    weights.write(&path)?;
+    Ok(path.metadata().map_err(Error::io("read", &path))?.len())
 }
 
 /// # Errors

@@ -29,7 +29,7 @@ use super::evaluate::{Evaluation, Evaluator};
 use super::folder::RunFolder;
 #[cfg(feature = "cli")]
 pub(crate) use super::folder::check_run;
-pub use super::folder::{is_complete, read_summary};
+pub use super::folder::{export, is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
 use super::version::SOURCE;

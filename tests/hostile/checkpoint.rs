@@ -14,7 +14,7 @@ use handful::study::status::{RunState, status};
 use handful::study::tables::Tables;
 use proptest::prelude::*;
 use proptest::sample::Index;
-use safetensors::{Dtype, SafeTensors};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use tempfile::TempDir;
 
 use super::config::{SMALL, registry};
@@ -261,21 +261,22 @@ const TEXTS: [&str; 7] = ["0", "-1", "9223372036854775807", "1e300", "nan", "'te
 fn forge(path: &Path, forgery: &Forgery) {
     let bytes = fs::read(path).expect("a checkpoint");
     let file = SafeTensors::deserialize(&bytes).expect("a checkpoint");
-    let names = |dtype: Dtype| {
-        let all = file.tensors().into_iter().filter(|(_, view)| view.dtype() == dtype && !view.data().is_empty());
+    let names = |dtypes: &[Dtype]| {
+        let chosen = |view: &TensorView| dtypes.contains(&view.dtype()) && !view.data().is_empty();
+        let all = file.tensors().into_iter().filter(|(_, view)| chosen(view));
         let mut names: Vec<String> = all.map(|(name, _)| name).collect();
         names.sort();
         names
     };
     let mut weights = Weights::read(path).expect("a checkpoint");
     let array = |weights: &Weights, index: &Index| {
-        let name = index.get(&names(Dtype::F32)).clone();
+        let name = index.get(&names(&[Dtype::F32, Dtype::F16])).clone();
         let shape = weights.shape(&name).expect("an array");
         let numbers = weights.get(&name, shape).expect("an array").to_vec();
         (name, numbers, shape)
     };
     let counts = |weights: &Weights, index: &Index| {
-        let name = index.get(&names(Dtype::U64)).clone();
+        let name = index.get(&names(&[Dtype::U64])).clone();
         let count = file.tensor(&name).expect("an array").shape()[0];
         (weights.counts(&name, count).expect("whole numbers"), name)
     };

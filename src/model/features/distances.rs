@@ -25,24 +25,24 @@ pub struct Distances {
 impl Distances {
     /// The distances in an environment's observations.
     pub fn new(spec: &Spec) -> Self {
+        // Minuend and subtrahend of a difference.
+        let pair = |i: usize| match &spec.observation[i].role {
+            Role::Difference { minuend, subtrahend } => Some([spec.index_of(minuend)?, spec.index_of(subtrahend)?]),
+            _ => None,
+        };
         let mut vectors: Vec<(Range<usize>, f32)> = Vec::new();
-        // Minuend and subtrahend of the last vector's first component.
-        let mut first = [0; 2];
         for (i, feature) in spec.observation.iter().enumerate() {
-            let Role::Difference { minuend, subtrahend } = &feature.role else { continue };
-            let (Some(a), Some(b)) = (spec.index_of(minuend), spec.index_of(subtrahend)) else { continue };
+            let Some([a, b]) = pair(i) else { continue };
             let continues = |components: &Range<usize>, scale: f32| {
-                let [a0, b0] = first;
-                let consecutive = i == components.end && [a, b] == [a0, b0].map(|index| index + components.len());
-                // Otherwise a chain of pairs, from A to B and from B to C, would be one vector.
-                consecutive && (a < b0 || b < a0) && scale == feature.scale
+                pair(components.start).is_some_and(|[a0, b0]| {
+                    let consecutive = i == components.end && [a, b] == [a0, b0].map(|index| index + components.len());
+                    // Otherwise a chain of pairs, from A to B and from B to C, would be one vector.
+                    consecutive && (a < b0 || b < a0) && scale == feature.scale
+                })
             };
             match vectors.last_mut() {
                 Some((components, scale)) if continues(components, *scale) => components.end += 1,
-                _ => {
-                    vectors.push((i..i + 1, feature.scale));
-                    first = [a, b];
-                }
+                _ => vectors.push((i..i + 1, feature.scale)),
             }
         }
         Self { vectors }

@@ -96,7 +96,7 @@ fn findings(tables: &Tables, task: &str, by_return: bool) -> Result<String> {
                  ({reaching:.0} of {seeds:.0} seeds do); it ends at {success:.0} %"
             ),
         };
-        text += &match (value("success_t_low")?, value("success_t_high")?) {
+        text += &match interval(tables, task, &method, "success_t")? {
             (Some(low), Some(high)) => {
                 format!(" (t interval over its {seeds:.0} seeds: [{:.0}, {:.0}]).", 100.0 * low, 100.0 * high)
             }
@@ -115,7 +115,7 @@ fn findings(tables: &Tables, task: &str, by_return: bool) -> Result<String> {
 fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
     let value = |column: &str| tables.value(task, method, column);
     let Some(mean) = value("return_mean")? else { return Ok(String::new()) };
-    let student = match (value("return_t_low")?, value("return_t_high")?) {
+    let student = match interval(tables, task, method, "return_t")? {
         (Some(low), Some(high)) => format!(" (t interval [{low:.1}, {high:.1}])"),
         _ => String::new(),
     };
@@ -137,23 +137,22 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
             continue;
         }
         let show = |column: &str, text: fn(f64) -> String| value(column).map(|found| found.map_or("-".into(), text));
-        let interval = |column: &str, kind: &str| -> Result<String> {
-            let [low, high] = [value(&format!("{column}{kind}_low"))?, value(&format!("{column}{kind}_high"))?];
-            Ok(match (value(column)?, low, high) {
-                (Some(x), Some(low), Some(high)) => format!("{x:.2} [{low:.2}, {high:.2}]"),
-                (Some(x), ..) => format!("{x:.2}"),
+        let with_interval = |column: &str, kind: &str| -> Result<String> {
+            Ok(match (value(column)?, interval(tables, task, &method, &format!("{column}{kind}"))?) {
+                (Some(x), (Some(low), Some(high))) => format!("{x:.2} [{low:.2}, {high:.2}]"),
+                (Some(x), _) => format!("{x:.2}"),
                 _ => "-".into(),
             })
         };
         rows += &format!(
             "| {method} | {} | {} | {} | {} | {} | {} | {} |\n",
-            interval("area_under_curve", "_t")?,
+            with_interval("area_under_curve", "_t")?,
             show("updates", |updates| format!("{updates:.0}"))?,
             show("action_change", |change| format!("{change:.2}"))?,
             show("optimism", |share| format!("{:+.0} %", (100.0 * share).round() + 0.0))?,
             show("return_correlation", |correlation| format!("{correlation:.2}"))?,
-            interval("improvement_over_sac", "")?,
-            interval("earlier_than_sac", "")?,
+            with_interval("improvement_over_sac", "")?,
+            with_interval("earlier_than_sac", "")?,
         );
     }
     if rows.is_empty() {
@@ -169,16 +168,14 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
 /// The comparison of a method with [`BASELINE`], if both learn the task.
 fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<String> {
     let value = |column: &str| tables.value(task, method, column);
-    let ends =
-        |column: &str| -> Result<_> { Ok((value(&format!("{column}_low"))?, value(&format!("{column}_high"))?)) };
     let measure = ("Success", "success_minus_sac", " percentage points");
     let mut text = difference(tables, task, method, measure, |share| format!("{:+.0}", (100.0 * share).round() + 0.0))?;
     let level = 100.0 * LEVEL;
-    match (value("sac_steps_ratio")?, ends("sac_steps_ratio")?) {
+    match (value("sac_steps_ratio")?, interval(tables, task, method, "sac_steps_ratio")?) {
         (Some(ratio), (Some(low), Some(high))) => {
             text += &format!(
                 " To {level:.0} % success `{BASELINE}` takes {ratio:.1} times as many steps [{low:.1}, {high:.1}]{}.",
-                match ends("sac_steps_ratio_t")? {
+                match interval(tables, task, method, "sac_steps_ratio_t")? {
                     (Some(low), Some(high)) => format!(", t interval [{low:.1}, {high:.1}]"),
                     _ => String::new(),
                 }
@@ -204,17 +201,23 @@ fn difference(
     (measure, column, unit): (&str, &str, &str),
     text: impl Fn(f64) -> String,
 ) -> Result<String> {
-    let entry = |name: &str| tables.value(task, method, &format!("{column}{name}"));
-    let (Some(difference), Some(low), Some(high)) = (entry("")?, entry("_low")?, entry("_high")?) else {
+    let difference = tables.value(task, method, column)?;
+    let (Some(difference), (Some(low), Some(high))) = (difference, interval(tables, task, method, column)?) else {
         return Ok(String::new());
     };
     let [value, from, to] = [difference, low, high].map(&text);
-    let intervals = match (entry("_t_low")?, entry("_t_high")?) {
+    let intervals = match interval(tables, task, method, &format!("{column}_t"))? {
         _ if low >= high => ", without an interval: resampling shows no spread".into(),
         (Some(low), Some(high)) => format!(" [{from}, {to}], t interval [{}, {}]", text(low), text(high)),
         _ => format!(" [{from}, {to}]"),
     };
     Ok(format!(" {measure} from the same test starts, minus that of `{BASELINE}`: {value}{unit}{intervals}."))
+}
+
+/// The ends of an interval, as far as there are any.
+fn interval(tables: &Tables, task: &str, method: &str, column: &str) -> Result<(Option<f64>, Option<f64>)> {
+    let end = |name: &str| tables.value(task, method, &format!("{column}_{name}"));
+    Ok((end("low")?, end("high")?))
 }
 
 /// How often the methods that learn a task were evaluated; a warning if not all alike.
