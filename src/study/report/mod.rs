@@ -164,7 +164,8 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
         ),
         n => format!(
             "Each learning method has at least {n:.0} seeds. With five, a bootstrap interval that should cover the truth in 95 % \
-             of cases covers it in 85 to 95 %, the less the more the seeds differ; the t interval over seeds is the safer one.\n"
+             of cases covers it in 85 to 95 %, the less the more the seeds differ; the t interval over seeds is the safer one. Neither \
+             accounts for a failure so rare that no seed shows it.\n"
         ),
     })
 }
