@@ -48,6 +48,8 @@ fn a_study_does_not_replace_the_tables_of_another() {
     let output = handful(here, &debug);
     assert!(output.status.success(), "the folder of the first run is there");
     assert!(text(&output.stderr).contains("own: 1 other complete run is there"), "{}", text(&output.stderr));
+    let weightless = ["export", "--run", "own/pendulum/random/seed0", "--out", "small"];
+    refused(here, &weightless, &["own/pendulum/random/seed0", "random learns nothing"]);
     std::fs::remove_dir_all(here.join("own/pendulum/debug")).expect("a folder");
     refused(here, &study(&["--out", "own"]), &["own", other]);
 }
@@ -329,7 +331,9 @@ fn train_evaluate_and_watch() {
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     let exported = summary["return_mean"].as_f64().expect("a number");
     assert!((exported - returns[2]).abs() < 0.1 * returns[2].abs(), "{exported} and {}", returns[2]);
-    refused(here, &["export", "--run", "run", "--out", "run"], &["run", "choose another --out"]);
+    for run in ["run", "small"] {
+        refused(here, &["export", "--run", run, "--out", run], &[run, "the run itself; choose another --out"]);
+    }
     refused(here, &["export", "--run", "short", "--out", "small"], &["small", "another run (its `"]);
     refused(here, &["export", "--run", "nowhere", "--out", "small"], &["nowhere", "there is no run"]);
 

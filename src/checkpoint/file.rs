@@ -14,6 +14,9 @@ use super::Weights;
 use crate::error::{Cause, Error, Result};
 use crate::files;
 
+#[cfg(target_endian = "big")]
+compile_error!("safetensors files are little-endian, and arrays are read and written as they lie in memory");
+
 /// The one entry of a file's metadata, an [`Envelope`] in JSON. (Several entries would be written in random order, and two
 /// equal checkpoints would be two different files.)
 const ENVELOPE: &str = "handful";

@@ -44,7 +44,7 @@ enum Command {
     Train(train::Args),
     /// Test a trained agent.
     Evaluate(evaluate::Args),
-    /// Write a run's settings and weights, the latter in half precision, to share them.
+    /// Write a run's settings and weights (matrices in half precision) to a folder to share.
     Export(export::Args),
     /// Make tables, figures and report.md anew from a study's CSV files.
     Report(report::Args),

@@ -265,8 +265,8 @@ fn read_weights(folder: &Path, config: &RunConfig) -> Result<(PathBuf, Weights)>
 /// with matrices in half precision ([`Weights::round_to_half`]). Returns the size of the weights' file in bytes.
 ///
 /// # Errors
-/// If the run has no weights, or they are damaged; if `out` holds another run, or a run that can be resumed; or if a file cannot be
-/// written.
+/// If there is no run in `folder`, it learns nothing, or its weights are missing, damaged, or those of another run; if `out` holds
+/// another run, or more of this run than its configuration and weights; or if a file cannot be written.
 pub fn export(folder: &Path, out: &Path) -> Result<u64> {
     let (_, config) = read_config(folder)?;
     if !config.learns() {
@@ -278,9 +278,12 @@ pub fn export(folder: &Path, out: &Path) -> Result<u64> {
     }
     let (_, mut weights) = read_weights(folder, &config)?;
     check_run(out, &config)?;
-    if out.join(CHECKPOINT).exists() {
-        let advice = "its weights belong to its checkpoint; choose another --out";
-        return Err(Error::Config(format!("{}: this folder holds a run, and {advice}", out.display())));
+    let same = out.canonicalize().is_ok_and(|out| folder.canonicalize().is_ok_and(|folder| folder == out));
+    if same || [CHECKPOINT, SUMMARY].iter().any(|file| out.join(file).exists()) || is_open(out) {
+        return Err(Error::Config(format!(
+            "{}: this folder holds the run itself; choose another --out",
+            out.display()
+        )));
     }
     weights.round_to_half();
     let path = out.join(WEIGHTS);
