@@ -18,11 +18,11 @@ use crate::checkpoint::Weights;
 use crate::error::{Error, Result};
 use crate::files;
 
-const CONFIG: &str = "config.toml";
-const CHECKPOINT: &str = "checkpoint/state.safetensors";
-const WEIGHTS: &str = "weights.safetensors";
-const SUMMARY: &str = "summary.toml";
-const LOCK: &str = ".lock";
+pub(super) const CONFIG: &str = "config.toml";
+pub(super) const CHECKPOINT: &str = "checkpoint/state.safetensors";
+pub(super) const WEIGHTS: &str = "weights.safetensors";
+pub(super) const SUMMARY: &str = "summary.toml";
+pub(super) const LOCK: &str = ".lock";
 
 /// The note in a checkpoint, and in weights, that holds the run's configuration.
 const RUN: &str = "run";
@@ -243,7 +243,7 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
 
 /// # Errors
 /// If the weights are missing, damaged, or those of another run.
-fn read_weights(folder: &Path, config: &RunConfig) -> Result<(PathBuf, Weights)> {
+pub(super) fn read_weights(folder: &Path, config: &RunConfig) -> Result<(PathBuf, Weights)> {
     let path = folder.join(WEIGHTS);
     if !path.exists() {
         let advice = "the run has saved no weights yet; let it train for longer";
@@ -259,37 +259,6 @@ fn read_weights(folder: &Path, config: &RunConfig) -> Result<(PathBuf, Weights)>
     check_own(&weights, &path, config)?;
     check_saved(&weights, &path)?;
     Ok((path, weights))
-}
-
-/// Writes what is needed to act as the run in `folder` has learned to, into the folder `out`: its configuration, and its weights,
-/// with matrices in half precision ([`Weights::round_to_half`]). Returns the size of the weights' file in bytes.
-///
-/// # Errors
-/// If there is no run in `folder`, it learns nothing, or its weights are missing, damaged, or those of another run; if `out` holds
-/// another run, or more of this run than its configuration and weights; or if a file cannot be written.
-pub fn export(folder: &Path, out: &Path) -> Result<u64> {
-    let (_, config) = read_config(folder)?;
-    if !config.learns() {
-        return Err(Error::Config(format!(
-            "{}: {} learns nothing; there are no weights",
-            folder.display(),
-            config.method
-        )));
-    }
-    let (_, mut weights) = read_weights(folder, &config)?;
-    check_run(out, &config)?;
-    let same = out.canonicalize().is_ok_and(|out| folder.canonicalize().is_ok_and(|folder| folder == out));
-    if same || [CHECKPOINT, SUMMARY].iter().any(|file| out.join(file).exists()) || is_open(out) {
-        return Err(Error::Config(format!(
-            "{}: this folder holds the run itself; choose another --out",
-            out.display()
-        )));
-    }
-    weights.round_to_half();
-    let path = out.join(WEIGHTS);
-    files::write(&out.join(CONFIG), config.to_toml().as_bytes())?;
-    weights.write(&path)?;
-    Ok(path.metadata().map_err(Error::io("read", &path))?.len())
 }
 
 /// # Errors

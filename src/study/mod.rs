@@ -32,6 +32,7 @@
 
 pub mod config;
 pub mod evaluate;
+mod export;
 #[cfg(feature = "study")]
 pub mod figures;
 mod folder;

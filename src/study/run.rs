@@ -26,10 +26,11 @@ use std::time::{Duration, Instant};
 
 use super::config::RunConfig;
 use super::evaluate::{Evaluation, Evaluator};
+pub use super::export::export;
 use super::folder::RunFolder;
 #[cfg(feature = "cli")]
 pub(crate) use super::folder::check_run;
-pub use super::folder::{export, is_complete, read_summary};
+pub use super::folder::{is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};
 use super::starts::training_seed;
 use super::version::SOURCE;
