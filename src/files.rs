@@ -65,6 +65,11 @@ fn target(path: &Path) -> Result<PathBuf> {
     Err(Error::io("write", path)(std::io::Error::other("its symbolic links form a loop")))
 }
 
+/// Whether two paths name one folder that exists.
+pub(crate) fn same_folder(a: &Path, b: &Path) -> bool {
+    a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
+}
+
 /// Removes the temporary files that killed processes have left in a folder, if they are older than `age`: younger ones may be
 /// another process's that is still writing. What cannot be removed stays: it is in nobody's way.
 pub(crate) fn sweep(folder: &Path, age: Duration) {

@@ -95,9 +95,9 @@ impl Weights {
     /// 6e-5 lose precision, and below 3e-8 become zero. Arrays of one row (biases, the constants of a normalisation) stay as they
     /// are, and so do matrices with a number beyond the range of f16 (65,504).
     pub fn round_to_half(&mut self) {
-        for (numbers, [_, rows, _]) in self.arrays.values_mut() {
+        for (numbers, _) in self.arrays.values_mut().filter(|(_, [_, rows, _])| *rows > 1) {
             let halves: Vec<f16> = numbers.iter().map(|x| f16::from_f32(*x)).collect();
-            if *rows > 1 && halves.iter().all(|x| x.is_finite()) {
+            if halves.iter().all(|x| x.is_finite()) {
                 *numbers = halves.to_f32_vec();
             }
         }

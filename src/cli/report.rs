@@ -7,7 +7,7 @@ use super::output::{answer, note};
 use super::refuse_folder_of;
 use crate::error::{Error, Result};
 #[cfg(feature = "study")]
-use crate::study::report;
+use crate::{files, study::report};
 
 #[derive(clap::Args)]
 pub(super) struct Args {
@@ -35,7 +35,7 @@ fn join(studies: &[PathBuf], to: &Path) -> Result<()> {
     refuse_folder_of("run", "config.toml", to)?;
     studies.iter().try_for_each(|study| check_study(study))?;
     // Joined with themselves, they would be written over.
-    if let Some(study) = studies.iter().find(|study| report::same_folder(study, to)) {
+    if let Some(study) = studies.iter().find(|study| files::same_folder(study, to)) {
         return Err(Error::Config(format!(
             "{} is one of the studies that are joined: take another --out",
             study.display()

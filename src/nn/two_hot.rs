@@ -23,10 +23,7 @@ use super::categorical::softmax;
 use super::ops::{Tensor3, values};
 use super::tape::TapeOps;
 
-/// `sign(x) ln(1 + |x|)`: a logarithm for both signs (Hafner et al. 2023, arXiv v1, eq. 2).
-pub fn symlog(x: f32) -> f32 {
-    x.signum() * x.abs().ln_1p()
-}
+pub use super::kernels::symlog;
 
 /// `sign(x) (exp(|x|) - 1)`, the inverse of [`symlog`].
 pub fn symexp(x: f32) -> f32 {

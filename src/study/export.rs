@@ -25,8 +25,7 @@ pub fn export(folder: &Path, out: &Path) -> Result<u64> {
     }
     let (_, mut weights) = read_weights(folder, &config)?;
     check_run(out, &config)?;
-    let same = out.canonicalize().is_ok_and(|out| folder.canonicalize().is_ok_and(|folder| folder == out));
-    if same || [CHECKPOINT, SUMMARY, LOCK].iter().any(|file| out.join(file).exists()) {
+    if files::same_folder(out, folder) || [CHECKPOINT, SUMMARY, LOCK].iter().any(|file| out.join(file).exists()) {
         return Err(Error::Config(format!(
             "{}: this folder holds the run itself; choose another --out",
             out.display()

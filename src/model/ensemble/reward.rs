@@ -15,7 +15,7 @@ use crate::env::{KnownReward, Spec};
 use crate::error::Result;
 use crate::model::{Distances, LatentFeatures, Normaliser};
 use crate::nn::GroupLasso;
-use crate::nn::frozen::{FrozenMlp, PANEL, Panels};
+use crate::nn::frozen::{Feature, FrozenMlp, PANEL, Panels};
 use crate::nn::two_hot::{symexp, symlog};
 use crate::replay::ReplayBuffer;
 use crate::rng::Rng;
@@ -127,15 +127,43 @@ impl Inputs {
     }
 
     /// Appends the inputs of a transition: observation, action, next observation.
-    fn push(&self, [obs, action, next_obs]: [&[f32]; 3], inputs: &mut Vec<f32>) {
-        self.push_observation(obs, inputs);
-        inputs.extend_from_slice(action);
-        self.push_observation(next_obs, inputs);
+    fn push(&self, transition: [&[f32]; 3], inputs: &mut Vec<f32>) {
+        let first = inputs.len();
+        self.push_scaled(transition, inputs);
+        self.squash(&mut inputs[first..]);
     }
 
-    fn push_observation(&self, obs: &[f32], inputs: &mut Vec<f32>) {
-        self.features.push(obs, inputs);
-        self.distances.push(obs, inputs);
+    /// Writes the inputs of some transitions to a panel.
+    fn fill(&self, transitions: &[[&[f32]; 3]], panel: &mut [Feature]) {
+        let mut scaled = Vec::with_capacity(self.width());
+        for (place, transition) in transitions.iter().enumerate() {
+            scaled.clear();
+            self.push_scaled(*transition, &mut scaled);
+            panel.iter_mut().zip(&scaled).for_each(|(x, scaled)| x.0[place] = *scaled);
+        }
+        self.squash(bytemuck::cast_slice_mut(panel));
+    }
+
+    /// Appends what [`Inputs::squash`] turns into the inputs of a transition.
+    fn push_scaled(&self, [obs, action, next_obs]: [&[f32]; 3], scaled: &mut Vec<f32>) {
+        self.features.push_scaled(obs, scaled);
+        self.distances.push_scaled(obs, scaled);
+        scaled.extend_from_slice(action);
+        self.features.push_scaled(next_obs, scaled);
+        self.distances.push_scaled(next_obs, scaled);
+    }
+
+    /// Turns scaled features into inputs, in place, `[width, rows]`.
+    fn squash(&self, scaled: &mut [f32]) {
+        let rows = scaled.len() / self.width();
+        let of_observation = (self.features.width() + self.distances.width()) * rows;
+        let (obs, others) = scaled.split_at_mut(of_observation);
+        let (_action, next_obs) = others.split_at_mut(self.actions * rows);
+        for observation in [obs, next_obs] {
+            let (features, distances) = observation.split_at_mut(self.features.width() * rows);
+            self.features.squash(features);
+            self.distances.squash(distances);
+        }
     }
 }
 
@@ -175,14 +203,10 @@ impl LearnedReward {
             .zip(next_obs.chunks_exact(observation));
         assert_eq!(rows.len(), rewards.len(), "one reward for each transition");
         let rows: Vec<_> = rows.map(|((obs, action), next_obs)| [obs, action, next_obs]).collect();
-        let (mut panels, mut inputs) = (Panels::default(), Vec::with_capacity(width));
+        let mut panels = Panels::default();
         for (rows, rewards) in rows.chunks(PANEL).zip(rewards.chunks_mut(PANEL)) {
             let x = panels.input(width);
-            for (place, row) in rows.iter().enumerate() {
-                inputs.clear();
-                self.inputs.push(*row, &mut inputs);
-                x.iter_mut().zip(&inputs).for_each(|(x, input)| x.0[place] = *input);
-            }
+            self.inputs.fill(rows, x);
             self.normaliser.normalise_panel(x);
             x.iter_mut().for_each(|x| x.0.iter_mut().for_each(|x| *x = x.clamp(-MAX_INPUT, MAX_INPUT)));
             let y = &network.forward(&mut panels)[0];

@@ -2,10 +2,8 @@
 
 use std::ops::Range;
 
-use super::feature_map::NEAR;
+use super::squash;
 use crate::env::{Role, Spec};
-use crate::nn::kernels::tanh;
-use crate::nn::two_hot::symlog;
 
 /// The distances in an observation, such as that from the hand to a cube: the lengths of its displacement vectors.
 ///
@@ -53,18 +51,27 @@ impl Distances {
         2 * self.vectors.len()
     }
 
-    /// Appends the inputs of one observation.
-    pub fn push(&self, obs: &[f32], inputs: &mut Vec<f32>) {
+    /// Appends what [`Distances::squash`] turns into the inputs of one observation: each distance in units of its scale, twice.
+    pub(crate) fn push_scaled(&self, obs: &[f32], scaled: &mut Vec<f32>) {
         for (components, scale) in &self.vectors {
             let square: f32 = obs[components.clone()].iter().map(|x| x * x).sum();
-            let distance = square.sqrt() / scale;
-            inputs.extend([symlog(distance), tanh(NEAR * distance)]);
+            scaled.extend([square.sqrt() / scale; 2]);
+        }
+    }
+
+    /// Turns scaled distances into network inputs, in place, `[width, rows]`.
+    pub(crate) fn squash(&self, scaled: &mut [f32]) {
+        let rows = scaled.len() / self.width().max(1);
+        for distance in scaled.chunks_exact_mut(2 * rows.max(1)) {
+            let (raw, near) = distance.split_at_mut(rows);
+            squash(raw, near);
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::feature_map::NEAR;
     use super::*;
     use crate::env::{Env, Feature, Task};
 
@@ -121,7 +128,8 @@ mod tests {
         let way = world.spec().index_of("hand to goal x").expect("a difference");
         let (mut inputs, scale) = (Vec::new(), world.spec().observation[way].scale);
         let distances = Distances::new(world.spec());
-        distances.push(&obs, &mut inputs);
+        distances.push_scaled(&obs, &mut inputs);
+        distances.squash(&mut inputs);
         let length = obs[way..way + 3].iter().map(|x| x * x).sum::<f32>().sqrt() / scale;
         assert_eq!(inputs.len(), distances.width());
         assert!((inputs[0] - length.ln_1p()).abs() < 1e-6 && (inputs[1] - (NEAR * length).tanh()).abs() < 1e-6);

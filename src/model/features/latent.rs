@@ -2,11 +2,9 @@
 
 use dfdx::tensor::Cpu;
 
-use super::Cube;
-use super::feature_map::NEAR;
+use super::{Cube, squash};
 use crate::env::{Role, Spec};
-use crate::nn::kernels::tanh;
-use crate::nn::two_hot::{symexp, symlog};
+use crate::nn::two_hot::symexp;
 use crate::nn::{Tensor3, tensor, values};
 
 /// Maps observations to encoder inputs and decoder outputs back to observations: `symlog((x - centre) / scale)` with the
@@ -85,6 +83,13 @@ impl LatentFeatures {
 
     /// Appends the encoder inputs of one observation.
     pub(crate) fn push(&self, obs: &[f32], inputs: &mut Vec<f32>) {
+        let first = inputs.len();
+        self.push_scaled(obs, inputs);
+        self.squash(&mut inputs[first..]);
+    }
+
+    /// Appends what [`LatentFeatures::squash`] turns into the encoder inputs of one observation.
+    pub(crate) fn push_scaled(&self, obs: &[f32], scaled: &mut Vec<f32>) {
         let mut canonical = Vec::new();
         let obs = if self.cubes.is_empty() {
             obs
@@ -93,9 +98,14 @@ impl LatentFeatures {
             self.cubes.iter().for_each(|cube| cube.apply(cube.to_canonical(obs), &mut canonical));
             &canonical
         };
-        let scaled = |i: &usize| (obs[*i] - self.centre[*i]) / self.scale[*i];
-        inputs.extend(self.raw.iter().map(|i| symlog(scaled(i))));
-        inputs.extend(self.near.iter().map(|i| tanh(NEAR * scaled(i))));
+        scaled.extend(self.raw.iter().chain(&self.near).map(|i| (obs[*i] - self.centre[*i]) / self.scale[*i]));
+    }
+
+    /// Turns scaled features into encoder inputs, in place, `[width, rows]`.
+    pub(crate) fn squash(&self, scaled: &mut [f32]) {
+        let rows = scaled.len() / self.width();
+        let (raw, near) = scaled.split_at_mut(self.raw.len() * rows);
+        squash(raw, near);
     }
 
     /// Observations (`[rows, observation]`, physical units) of decoder outputs, `[1, rows, width]`.

@@ -33,3 +33,14 @@ pub use distances::Distances;
 pub use feature_map::FeatureMap;
 pub use latent::LatentFeatures;
 pub use normaliser::Normaliser;
+
+use self::feature_map::NEAR;
+use crate::nn::kernels::{symlog, tanh, vectorised_fn};
+
+vectorised_fn! {
+    /// Turns scaled features into network inputs, in place: `raw` through symlog, `near` through the tanh.
+    fn squash(raw: &'a mut [f32], near: &'a mut [f32]) {
+        raw.iter_mut().for_each(|x| *x = symlog(*x));
+        near.iter_mut().for_each(|x| *x = tanh(NEAR * *x));
+    }
+}

@@ -21,7 +21,7 @@ mod matrix;
 pub(crate) use activation::activate;
 pub use activation::{Activation, add_and_activate, through_activation};
 pub use dense::{DenseShape, dense, dense_input_gradient, dense_parameter_gradients};
-pub use math::{exp, sigmoid, softplus, tanh};
+pub use math::{exp, sigmoid, softplus, symlog, tanh};
 pub(crate) use math::{mish, mish_slope, relu, silu, silu_slope};
 pub use matrix::{Matrix, matmul, matmul_into};
 

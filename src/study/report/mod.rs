@@ -34,7 +34,7 @@ pub fn write(from: &Path, to: &Path) -> Result<String> {
 /// As [`write()`].
 pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String)) -> Result<String> {
     let tables = Tables::read(from)?;
-    if !same_folder(from, to) && to.join("tests.csv").exists() {
+    if !files::same_folder(from, to) && to.join("tests.csv").exists() {
         // Its summary and figures would be replaced by those of other numbers.
         return Err(Error::Config(format!(
             "{}: this folder holds a study of its own; choose another --out",
@@ -94,11 +94,6 @@ pub fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
     tables.check_place(to)?;
     tables.write(to)?;
     replays::join(folders, to)
-}
-
-/// Whether two paths name one folder that exists.
-pub(crate) fn same_folder(a: &Path, b: &Path) -> bool {
-    a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
 /// What stands above the numbers of runs that served to choose settings.
