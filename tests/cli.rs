@@ -316,6 +316,8 @@ fn train_evaluate_and_watch() {
     let output = handful(here, &changed("steps.toml"));
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(summary["return_mean"].as_f64(), Some(returns[2]), "{summary}");
+    std::fs::write(here.join("other.toml"), "[sac]\nlatent_features = true\n").expect("a writable folder");
+    refused(here, &changed("other.toml"), &["other.toml", "weights mean nothing", "its `sac.latent_features` is"]);
     refused(here, &changed("wider.toml"), &["weights.safetensors", "has the sizes", "are expected"]);
     refused(here, &changed("wrong.toml"), &["wrong.toml", "action_repeats"]);
 
@@ -335,6 +337,23 @@ fn train_evaluate_and_watch() {
         refused(here, &["export", "--run", run, "--out", run], &[run, "the run itself; choose another --out"]);
     }
     refused(here, &["export", "--run", "short", "--out", "small"], &["small", "another run (its `"]);
+    // Neither weights in full precision nor anything else is replaced.
+    for (file, text) in [("copy/weights.safetensors", None), ("copied/weights.safetensors", Some("precious"))] {
+        std::fs::create_dir(here.join(file).parent().expect("a folder")).expect("a writable folder");
+        match text {
+            Some(text) => std::fs::write(here.join(file), text).expect("a writable folder"),
+            None => _ = std::fs::copy(here.join("run/weights.safetensors"), here.join(file)).expect("weights"),
+        }
+        let out = file.split('/').next().expect("a folder");
+        refused(here, &["export", "--run", "run", "--out", out], &[file, "that were not exported"]);
+    }
+    refused(here, &["watch", "--run", "run", "--out", "copied/weights.safetensors"], &["not a replay"]);
+    assert_eq!(std::fs::read(here.join("copied/weights.safetensors")).expect("the file"), b"precious");
+    // A run that has not ended says so.
+    std::fs::rename(here.join("run/summary.toml"), here.join("summary.toml")).expect("a summary");
+    let output = handful(here, &["export", "--run", "run", "--out", "small"]);
+    assert!(output.status.success() && text(&output.stderr).contains("has not ended"), "{}", text(&output.stderr));
+    std::fs::rename(here.join("summary.toml"), here.join("run/summary.toml")).expect("a summary");
     refused(here, &["export", "--run", "nowhere", "--out", "small"], &["nowhere", "there is no run"]);
 
     let output = handful(here, &["watch", "--run", "run", "--seed", "2"]);
@@ -510,4 +529,17 @@ fn an_ignored_hang_up_stays_ignored() {
     let mut said = String::new();
     std::io::Read::read_to_string(&mut child.stderr.take().expect("a pipe"), &mut said).expect("text");
     assert_eq!(said.matches("finishing the episodes").count(), 1, "{said}");
+}
+
+/// Numbers of threads that a library would panic at, ignore, or spend minutes on.
+#[test]
+fn numbers_of_threads_are_checked() {
+    for (name, value) in [("POLARS_MAX_THREADS", "0"), ("RAYON_NUM_THREADS", "70000"), ("RAYON_NUM_THREADS", "two")] {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_handful"));
+        let output =
+            program.args(["report", "--from", "nowhere"]).env(name, value).output().expect("the program starts");
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains(&format!("{name} is `{value}`; it must be")), "{said}");
+    }
 }

@@ -103,6 +103,13 @@ impl Weights {
         }
     }
 
+    /// Whether [`Weights::round_to_half`] would change nothing.
+    pub fn is_rounded(&self) -> bool {
+        let mut rounded = self.clone();
+        rounded.round_to_half();
+        rounded == *self
+    }
+
     /// The name of an array that holds NaN, if there is one.
     pub fn with_nan(&self) -> Option<&str> {
         let found = self.arrays.iter().find(|(_, (numbers, _))| numbers.iter().any(|x| x.is_nan()));

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::output::answer;
-use super::{note_other_shake, whole};
+use super::{note_other_shake, note_unfinished, whole};
 use crate::error::Result;
 use crate::study::evaluate::{EvalSeeds, Evaluation, Evaluator};
 use crate::study::registry::Registry;
@@ -34,6 +34,7 @@ pub(super) struct Args {
 pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let (config, mut method) = registry.trained_method_with(&args.run, args.config.as_deref())?;
     note_other_shake(&config);
+    note_unfinished(&args.run);
     let seeds = args.seed.map_or(args.starts.unwrap_or(config.starts).test(), EvalSeeds::Seed);
     let mut evaluator = Evaluator::new(|| registry.make_env(&config))?;
     let mut evaluation = Evaluation::default();

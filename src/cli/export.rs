@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::output::answer;
-use super::refuse_folder_of;
+use super::{note_unfinished, refuse_folder_of};
 use crate::error::Result;
 use crate::study::run::export;
 
@@ -20,5 +20,6 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> Result<()> {
     refuse_folder_of("study", "tests.csv", &args.out)?;
     let bytes = export(&args.run, &args.out)?;
+    note_unfinished(&args.run);
     answer(format_args!("{}: settings and weights, {} kB", args.out.display(), bytes.div_ceil(1000)))
 }

@@ -27,6 +27,7 @@ use crate::error::{Error, Result};
 use crate::rng::{read_shake, shake};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
+use crate::study::run::is_unfinished;
 
 /// Model-based reinforcement learning on a robot arm. Without a command: the quick study.
 #[derive(Parser)]
@@ -98,6 +99,13 @@ pub fn main(registry: &Registry) -> ExitCode {
 
 /// The threads that all commands share.
 fn begin_threads() -> Result<()> {
+    // What a library would panic at, ignore, or spend minutes on.
+    for (name, least) in [("RAYON_NUM_THREADS", 0), ("POLARS_MAX_THREADS", 1)] {
+        let value = std::env::var_os(name).unwrap_or_default().to_string_lossy().into_owned();
+        if !value.is_empty() && !value.parse().is_ok_and(|count: usize| (least..=1024).contains(&count)) {
+            return Err(Error::Config(format!("{name} is `{value}`; it must be a whole number from {least} to 1024")));
+        }
+    }
     match rayon::ThreadPoolBuilder::new().build_global() {
         // Without a cause, a program of one's own has begun them already.
         Err(problem) if problem.source().is_some() => {
@@ -111,6 +119,13 @@ fn begin_threads() -> Result<()> {
 fn whole<T: FromStr>(text: &str) -> Result<T, &'static str> {
     let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     text.parse().map_err(|_| if digits { "it is too large" } else { "give a whole number from 0 on" })
+}
+
+/// Says that the run in a folder has not ended, so that its weights are not those that it will end with.
+fn note_unfinished(folder: &Path) {
+    if is_unfinished(folder) {
+        note(format_args!("{}: this run has not ended; these are its weights so far", folder.display()));
+    }
 }
 
 /// Runs and studies have tables of the same names: neither writes over those of the other.

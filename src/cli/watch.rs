@@ -1,9 +1,11 @@
 //! `watch`: an episode as a 3D replay.
 
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use super::output::answer;
-use super::{note_other_shake, whole};
+use super::{note_other_shake, note_unfinished, whole};
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
 use crate::study::registry::Registry;
@@ -49,11 +51,26 @@ fn without_training(registry: &Registry, task: &str, policy: &str, seed: u64) ->
     }
 }
 
+/// # Errors
+/// If there is a file that is no page, which would be lost, or cannot be read.
+fn refuse_other_file(path: &Path) -> Result<()> {
+    let mut begins = Vec::new();
+    if path.is_file() {
+        let read = File::open(path).and_then(|file| file.take(9).read_to_end(&mut begins));
+        read.map_err(Error::io("read", path))?;
+    }
+    if begins.is_empty() || begins.eq_ignore_ascii_case(b"<!doctype") {
+        return Ok(());
+    }
+    Err(Error::Config(format!("{}: this file is not a replay; choose another --out", path.display())))
+}
+
 pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
     let (config, mut method, default) = match (&args.run, &args.task) {
         (Some(folder), _) => {
             let (config, method) = registry.trained_method(folder)?;
             note_other_shake(&config);
+            note_unfinished(folder);
             (config, method, folder.join("watch.html"))
         }
         (None, Some(task)) => {
@@ -63,6 +80,8 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
         }
         (None, None) => unreachable!("the command line asks for one of them"),
     };
+    let path = args.out.clone().unwrap_or(default);
+    refuse_other_file(&path)?;
     let title = format!("{}, {}, seed {}", config.task, config.method, args.seed);
     let reset_seed = EvalSeeds::Seed(args.seed).seed(0)?;
     let recording = Recording::of_episode(title, registry.make_env(&config)?, &mut method, reset_seed)?;
@@ -70,7 +89,6 @@ pub(super) fn run(registry: &Registry, args: &Args) -> Result<()> {
         let advice = "draws nothing to watch: implement `Env::scene` and `Env::poses`";
         return Err(Error::Unsupported(format!("`{}` {advice}", config.task)));
     }
-    let path = args.out.clone().unwrap_or(default);
     recording.write(&path)?;
     let outcome = if recording.success() { "success" } else { "no success" };
     answer(format_args!("{} steps, {outcome}; open {} in a browser", recording.steps(), path.display()))

@@ -2,8 +2,7 @@
 
 use std::path::Path;
 
-use super::folder::{CHECKPOINT, CONFIG, LOCK, SUMMARY, WEIGHTS, check_run, read_config, read_weights};
-#[cfg(doc)]
+use super::folder::{CHECKPOINT, CONFIG, SUMMARY, WEIGHTS, check_run, is_open, read_config, read_weights};
 use crate::checkpoint::Weights;
 use crate::error::{Error, Result};
 use crate::files;
@@ -13,7 +12,7 @@ use crate::files;
 ///
 /// # Errors
 /// If there is no run in `folder`, it learns nothing, or its weights are missing, damaged, or those of another run; if `out` holds
-/// another run, or was made by carrying out this one; or if a file cannot be written.
+/// another run, was made by carrying out this one, or has weights that were not exported; or if a file cannot be written.
 pub fn export(folder: &Path, out: &Path) -> Result<u64> {
     let (_, config) = read_config(folder)?;
     if !config.learns() {
@@ -25,14 +24,19 @@ pub fn export(folder: &Path, out: &Path) -> Result<u64> {
     }
     let (_, mut weights) = read_weights(folder, &config)?;
     check_run(out, &config)?;
-    if files::same_folder(out, folder) || [CHECKPOINT, SUMMARY, LOCK].iter().any(|file| out.join(file).exists()) {
+    let is_run = [CHECKPOINT, SUMMARY].iter().any(|file| out.join(file).exists()) || is_open(out);
+    if is_run || files::same_folder(out, folder) {
         return Err(Error::Config(format!(
             "{}: this folder holds the run itself; choose another --out",
             out.display()
         )));
     }
-    weights.round_to_half();
     let path = out.join(WEIGHTS);
+    if path.exists() && !Weights::read(&path).is_ok_and(|there| there.is_rounded()) {
+        let advice = "there are weights that were not exported; choose another --out, or remove them";
+        return Err(Error::Config(format!("{}: {advice}", path.display())));
+    }
+    weights.round_to_half();
     weights.write(&path)?;
     // Last, so that a folder without weights is never taken for a run.
     files::write(&out.join(CONFIG), config.to_toml().as_bytes())?;

@@ -223,7 +223,7 @@ pub(super) fn check_tables(folder: &Path) -> Result<()> {
 /// If there is none, or it is damaged.
 pub(super) fn read_config(folder: &Path) -> Result<(PathBuf, RunConfig)> {
     let path = folder.join(CONFIG);
-    if !path.exists() {
+    if !path.try_exists().map_err(Error::io("read", &path))? {
         let advice = "there is no run; give a folder that has a config.toml, such as runs/quick/reach/sac/seed0";
         return Err(Error::Config(format!("cannot read {}: {advice}", folder.display())));
     }
@@ -246,7 +246,7 @@ pub(super) fn load_weights(folder: &Path, config: &RunConfig, method: &mut Metho
 pub(super) fn read_weights(folder: &Path, config: &RunConfig) -> Result<(PathBuf, Weights)> {
     let path = folder.join(WEIGHTS);
     if !path.exists() {
-        let advice = "the run has saved no weights yet; let it train for longer";
+        let advice = "there are no weights; if the run has saved none yet, let it train for longer";
         return Err(Error::Config(format!("{}: {advice}", folder.display())));
     }
     let weights = Weights::read(&path).map_err(|problem| match problem {
@@ -278,7 +278,9 @@ fn check_own(weights: &Weights, path: &Path, config: &RunConfig) -> Result<()> {
     if let Some(text) = weights.note(RUN) {
         let theirs = RunConfig::from_toml(text).map_err(|problem| bad_config(path, &problem))?;
         if let Some(difference) = difference(&theirs.to_table(), &config.to_table()) {
-            let advice = format!("it belongs to another run ({difference}); put this run's in its place, or remove it");
+            let advice = format!(
+                "it belongs to another run ({difference}), or {CONFIG} was changed since; put back what belongs to this run"
+            );
             return Err(Error::checkpoint(path, advice, None));
         }
     }
@@ -320,13 +322,18 @@ pub(super) fn is_open(folder: &Path) -> bool {
     File::open(folder.join(LOCK)).is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
+/// Whether a folder holds a run that has begun and not ended.
+pub(crate) fn is_unfinished(folder: &Path) -> bool {
+    folder.join(CHECKPOINT).exists() && !folder.join(SUMMARY).exists()
+}
+
 /// The first setting in which two configurations differ.
 pub(super) fn difference(there: &toml::Table, wanted: &toml::Table) -> Option<String> {
     difference_in("", there, wanted)
 }
 
 /// The same for settings whose names begin with `path`.
-fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
+pub(super) fn difference_in(path: &str, there: &toml::Table, wanted: &toml::Table) -> Option<String> {
     let key = there.keys().chain(wanted.keys()).find(|key| there.get(*key) != wanted.get(*key))?;
     let name = format!("{path}{key}");
     match (there.get(key), wanted.get(key)) {

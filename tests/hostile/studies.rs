@@ -16,6 +16,7 @@ fn study(runs: &[&str], starts: &str) -> TempDir {
     let mut tests =
         String::from("task,method,seed,episode,return,success,length,stage,sparc,ldlj,action_change,starts\n");
     let mut evaluations = String::from("task,method,seed,step,episodes,success\n");
+    let mut values = String::from("task,method,seed,step,expected,realised,rmse,correlation\n");
     let mut configurations = String::from("task,method,seed,version,configuration\n");
     for run in runs {
         for episode in 1..=3 {
@@ -24,6 +25,7 @@ fn study(runs: &[&str], starts: &str) -> TempDir {
         let steps = if run.contains("debug") { 1000 } else { 0 };
         for step in (0..=steps).step_by(500).filter(|_| steps > 0) {
             evaluations += &format!("{run},{step},20,0.5\n");
+            values += &format!("{run},{step},1.0,2.0,1.0,0.5\n");
         }
         let seed = run.rsplit(',').next().expect("a seed");
         let settings = format!(
@@ -36,7 +38,7 @@ fn study(runs: &[&str], starts: &str) -> TempDir {
         ("evaluations.csv", evaluations),
         ("runs.csv", configurations),
         ("models.csv", String::new()),
-        ("values.csv", String::new()),
+        ("values.csv", values),
     ] {
         fs::write(folder.path().join(file), text).expect("a writable folder");
     }
@@ -70,10 +72,16 @@ fn a_run_that_is_not_whole_is_left_out_by_name() {
     let last_line_less = |text: String| text.trim_end().rsplit_once('\n').expect("several lines").0.to_string() + "\n";
     let middle_less = |text: String| text.replace("pole,debug,1,500,20,0.5\n", "");
     let other = |text: String| text.replace("seed = 1\n", "seed = 1\nreward = 2\n");
+    let elsewhere = |text: String| {
+        let (before, last) = text.rsplit_once("starts = ").expect("a configuration");
+        format!("{before}starts = {}", last.replace("test", "development"))
+    };
     for (file, change, reason) in [
         ("evaluations.csv", &last_line_less as &dyn Fn(String) -> String, "is at step 500 of 1000"),
         ("evaluations.csv", &middle_less, "its evaluation at step 500 is not in"),
         ("tests.csv", &last_line_less, "its test in `tests.csv` has 2 of 3 episodes"),
+        ("values.csv", &last_line_less, "its last evaluation, at step 1000, is not in `values.csv`"),
+        ("runs.csv", &elsewhere, "tested on the starts `development`, `tests.csv` says `test`"),
         ("runs.csv", &other, "it has another configuration than with seed 0 (its `reward` is 2, not nothing)"),
     ] {
         let folder = study(&ALL, "test");
@@ -95,6 +103,15 @@ fn a_run_that_is_not_whole_is_left_out_by_name() {
     edit(&none, "tests.csv", last_line_less);
     let said = Tables::read(none.path()).expect_err("no whole run").to_string();
     assert!(said.contains("no run can be reported; `debug` on `pole` with seed 1: its test in"), "{said}");
+}
+
+/// Without the column, the tests would count as those on the test's starts.
+#[test]
+fn tuning_runs_stay_tuning_runs() {
+    let tuning = study(&ALL, "development");
+    edit(&tuning, "tests.csv", |text| text.replace(",starts\n", "\n").replace(",development\n", "\n"));
+    let said = Tables::read(tuning.path()).expect_err("other starts").to_string();
+    assert!(said.contains("tested on the starts `development`, `tests.csv` says `test`"), "{said}");
 }
 
 #[test]

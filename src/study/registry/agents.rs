@@ -10,6 +10,7 @@ use crate::agent::{
 use crate::env::{Env, SharedReward, Spec};
 use crate::error::{Error, Result};
 use crate::settings::{Ranges, choices};
+use crate::study::folder::difference_in;
 
 /// What an agent is made from, beside its settings.
 pub struct AgentContext<'a> {
@@ -72,6 +73,8 @@ pub(super) struct AgentEntry {
     pub(super) complete: Complete,
     pub(super) check: Check,
     pub(super) choices: Vec<String>,
+    /// Settings without which trained weights would mean something else, even where all arrays keep their sizes.
+    trained_with: &'static [&'static str],
     #[allow(clippy::type_complexity)] // a closure's type, named once
     pub(super) make: Box<dyn Fn(&AgentContext, Table) -> Result<Method> + Send + Sync>,
 }
@@ -93,7 +96,27 @@ impl AgentEntry {
             complete: completed::<C>,
             check: |_, _| Ok(()),
             choices,
+            trained_with: &[],
             make: Box::new(make),
+        }
+    }
+
+    fn trained_with(self, settings: &'static [&'static str]) -> Self {
+        Self { trained_with: settings, ..self }
+    }
+
+    /// # Errors
+    /// If settings differ that belong to the trained weights.
+    pub(super) fn check_trained_with(&self, trained: &Table, changed: &Table) -> Result<()> {
+        let [trained, changed] = [trained, changed].map(|settings| -> Table {
+            let of_weights = self.trained_with.iter().filter_map(|key| settings.get_key_value(*key));
+            of_weights.map(|(key, value)| (key.clone(), value.clone())).collect()
+        });
+        match difference_in(&format!("{}.", self.name), &trained, &changed) {
+            None => Ok(()),
+            Some(difference) => Err(Error::Config(format!(
+                "the run's weights mean nothing with this setting ({difference}); leave it out"
+            ))),
         }
     }
 
@@ -124,8 +147,8 @@ pub(super) fn register(registry: Registry) -> Registry {
         .add_agent(oracle)
         .add_agent(scripted)
         .policy("random", |context, NoOptions {}| Ok(Random::new(context.spec, context.seed)))
-        .add_agent(sac.with_ranges::<SacConfig>())
-        .add_agent(dreamer.with_ranges::<DreamerConfig>())
-        .add_agent(tdmpc2.with_ranges::<TdMpc2Config>())
-        .add_agent(pets.with_ranges::<PetsConfig>())
+        .add_agent(sac.with_ranges::<SacConfig>().trained_with(&["latent_features"]))
+        .add_agent(dreamer.with_ranges::<DreamerConfig>().trained_with(&["world", "action_repeat"]))
+        .add_agent(tdmpc2.with_ranges::<TdMpc2Config>().trained_with(&["model", "action_repeat", "reward_unit"]))
+        .add_agent(pets.with_ranges::<PetsConfig>().trained_with(&["ensemble", "action_repeat"]))
 }

@@ -287,7 +287,7 @@ impl Registry {
     }
 
     /// As [`Registry::trained_method`], but the method acts with the settings that `file` changes: with another planner, for
-    /// example, in the model that the run has learned. Settings that shape its networks cannot change.
+    /// example, in the model that the run has learned. Settings that belong to the weights cannot change.
     ///
     /// # Errors
     /// As [`Registry::trained_method`]; or if the file cannot be read, a field or value in it is wrong, or the weights do not fit
@@ -299,8 +299,12 @@ impl Registry {
         if let Some(file) = file {
             let mut table = config.to_table();
             self.change(&mut table, file, &config.task, &self.choices(&config.task)?)?;
-            config = RunConfig::from_table(table).map_err(|problem| bad_config(file, &problem))?;
-            self.complete(&mut config, file).map_err(|problem| in_file(file, problem))?;
+            let mut changed = RunConfig::from_table(table).map_err(|problem| bad_config(file, &problem))?;
+            let agent = self.agent_entry(&config.agent)?;
+            let checked = self.complete(&mut changed, file);
+            let checked = checked.and_then(|()| agent.check_trained_with(&config.settings, &changed.settings));
+            checked.map_err(|problem| in_file(file, problem))?;
+            config = changed;
         }
         let mut method = self.method(&config)?;
         // Not `config.learns()`: a file may say that it has no steps.

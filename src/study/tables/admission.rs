@@ -26,20 +26,21 @@ pub(super) struct Candidate {
 impl Admission {
     /// Why the run is left out, as the end of a sentence that begins with the run.
     pub fn objection(&self, run: &Candidate) -> Option<String> {
+        let (seed, first) = self.first.get(&run.of_method())?;
+        let settings = run.common_settings();
+        let different = settings.as_ref().zip(first.as_ref()).and_then(|(settings, first)| difference(settings, first));
+        if let Some(how) = different {
+            return Some(format!("has another configuration than with seed {seed} ({how})"));
+        }
         if self.admitted.contains(&run.key()) {
             return Some("is there twice".into());
         }
-        let (seed, first) = self.first.get(&run.of_method())?;
-        match (run.common_settings(), first) {
-            (Some(settings), Some(first)) => {
-                let how = difference(&settings, first)?;
-                Some(format!("has another configuration than with seed {seed} ({how})"))
-            }
-            (None, None) => None,
+        match (settings, first) {
             (None, Some(_)) => Some(format!("cannot be compared with seed {seed}: its configuration is not recorded")),
             (Some(_), None) => {
                 Some(format!("cannot be compared with seed {seed}: the configuration of that is not recorded"))
             }
+            _ => None,
         }
     }
 

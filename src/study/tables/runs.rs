@@ -155,9 +155,15 @@ pub(super) fn check_runs(tables: &Tables) -> Result<()> {
     if tested.is_empty() {
         return Err(Error::Config("the study has no test episode: there is nothing to report".into()));
     }
-    for table in [&tables.models, &tables.values, &tables.runs, &tables.evaluations] {
+    let others = [
+        ("models", &tables.models),
+        ("values", &tables.values),
+        ("runs", &tables.runs),
+        ("evaluations", &tables.evaluations),
+    ];
+    for (file, table) in others {
         if let Some(run) = names(table)?.difference(&tested).next() {
-            return Err(incomplete(run, "tests.csv"));
+            return Err(incomplete(run, &format!("tests.csv, but in its {file}.csv")));
         }
     }
     let learns = |(task, method, _): &&RunName| evaluated.iter().any(|(of, other, _)| (of, other) == (task, method));

@@ -8,7 +8,7 @@ use polars::prelude::*;
 use super::admission::{Admission, Candidate};
 use super::gather::left_out;
 use super::runs::{RunName, incomplete, row_names, run_names, said_of, settings};
-use super::{Tables, inside, numbers};
+use super::{Tables, inside, numbers, strings};
 use crate::error::{Error, Result};
 
 impl Tables {
@@ -46,6 +46,10 @@ impl Tables {
         let names: BTreeSet<RunName> = names.into_iter().collect();
         let steps = numbers_of_each(&self.evaluations, "step").map_err(inside)?;
         let episodes = numbers_of_each(&self.tests, "episode").map_err(inside)?;
+        let starts = starts_of_each(&self.tests).map_err(inside)?;
+        let evaluated = [("values.csv", &self.values), ("models.csv", &self.models)];
+        let evaluated = evaluated.map(|(file, table)| Ok((file, numbers_of_each(table, "step").map_err(inside)?)));
+        let evaluated = evaluated.into_iter().collect::<Result<Vec<_>>>()?;
         let (mut admission, mut objections) = (Admission::default(), Vec::new());
         for name in run_names(&self.tests).map_err(inside)? {
             if !names.contains(&name) {
@@ -56,7 +60,9 @@ impl Tables {
             if run.number("steps").is_some_and(|steps| steps > 0) && !steps.contains_key(&name) {
                 return Err(incomplete(&name, "evaluations.csv"));
             }
-            let lost = lost_rows(&run, steps.get(&name), episodes.get(&name));
+            let lost = lost_rows(&run, steps.get(&name), episodes.get(&name))
+                .or_else(|| evaluated.iter().find_map(|(file, steps)| lost_end(&run, file, steps)))
+                .or_else(|| other_starts(&run, starts.get(&name)));
             match lost.or_else(|| admission.objection(&run).map(|objection| format!("it {objection}"))) {
                 Some(reason) => objections.push((name, reason)),
                 None => admission.admit(&run),
@@ -81,6 +87,32 @@ fn lost_rows(run: &Candidate, steps: Option<&Vec<i64>>, episodes: Option<&Vec<i6
     }
     let (wanted, there) = (run.number("test_episodes")?, episodes?.len());
     (usize::try_from(wanted) != Ok(there)).then(|| format!("its test in `tests.csv` has {there} of {wanted} episodes"))
+}
+
+/// Whether a table that has rows of this run's method lacks those of its last evaluation. `steps` are those of all runs.
+fn lost_end(run: &Candidate, file: &str, steps: &BTreeMap<RunName, Vec<i64>>) -> Option<String> {
+    let Candidate { task, method, seed, .. } = run;
+    steps.keys().find(|(of_task, of_method, _)| (of_task, of_method) == (task, method))?;
+    let (last, budget) =
+        (steps.get(&(task.clone(), method.clone(), *seed)).and_then(|steps| steps.last()), run.number("steps")?);
+    (last != Some(&budget)).then(|| format!("its last evaluation, at step {budget}, is not in `{file}`"))
+}
+
+/// Whether a run was tested on other starts than its configuration says. Where nothing is said, they are the test's.
+fn other_starts(run: &Candidate, tested: Option<&String>) -> Option<String> {
+    let said = run.settings.as_ref()?.get("starts").and_then(toml::Value::as_str).unwrap_or("test");
+    let tested = tested.map_or("test", String::as_str);
+    (said != tested).then(|| {
+        format!("its configuration says that it is tested on the starts `{said}`, `tests.csv` says `{tested}`")
+    })
+}
+
+/// On which starts each run was tested, if that is told.
+fn starts_of_each(tests: &DataFrame) -> PolarsResult<BTreeMap<RunName, String>> {
+    if tests.column("starts").is_err() {
+        return Ok(BTreeMap::new());
+    }
+    Ok(row_names(tests)?.into_iter().zip(strings(tests, "starts")?).collect())
 }
 
 /// The numbers in a column, for each run.
