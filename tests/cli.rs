@@ -317,7 +317,11 @@ fn train_evaluate_and_watch() {
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(summary["return_mean"].as_f64(), Some(returns[2]), "{summary}");
     std::fs::write(here.join("other.toml"), "[sac]\nlatent_features = true\n").expect("a writable folder");
-    refused(here, &changed("other.toml"), &["other.toml", "weights mean nothing", "its `sac.latent_features` is"]);
+    refused(
+        here,
+        &changed("other.toml"),
+        &["other.toml", "belongs to the run's weights", "its `sac.latent_features` is"],
+    );
     refused(here, &changed("wider.toml"), &["weights.safetensors", "has the sizes", "are expected"]);
     refused(here, &changed("wrong.toml"), &["wrong.toml", "action_repeats"]);
 

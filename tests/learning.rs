@@ -19,6 +19,7 @@ use handful::study::config::RunConfig;
 use handful::study::evaluate::{EvalSeeds, Evaluator};
 use handful::study::registry::Registry;
 use handful::study::run::{Event, Run, is_complete};
+use rayon::prelude::*;
 
 /// As in the program.
 #[global_allocator]
@@ -650,9 +651,10 @@ fn renamed_keys_are_understood() {
 #[test]
 fn trained_agents_that_ship_still_succeed() {
     let registry = Registry::standard();
-    let mut agents = 0;
-    for folder in std::fs::read_dir("data/trained").expect("a folder") {
-        let folder = folder.expect("an entry").path();
+    let folders = std::fs::read_dir("data/trained").expect("a folder");
+    let folders: Vec<_> = folders.map(|folder| folder.expect("an entry").path()).collect();
+    assert_eq!(folders.len(), 13);
+    folders.into_par_iter().for_each(|folder| {
         let (config, mut method) = registry.trained_method(&folder).expect("a trained agent");
         let mut evaluator = Evaluator::new(|| registry.make_env(&config)).expect("a world");
         let mut successes = |episodes: usize| {
@@ -661,7 +663,5 @@ fn trained_agents_that_ship_still_succeed() {
         };
         // Seven in the first seven are seven of ten.
         assert!(successes(7) == 7.0 || successes(10) >= 7.0, "{}", folder.display());
-        agents += 1;
-    }
-    assert_eq!(agents, 13);
+    });
 }

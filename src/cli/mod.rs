@@ -121,7 +121,7 @@ fn whole<T: FromStr>(text: &str) -> Result<T, &'static str> {
     text.parse().map_err(|_| if digits { "it is too large" } else { "give a whole number from 0 on" })
 }
 
-/// Says that the run in a folder has not ended, so that its weights are not those that it will end with.
+/// Says that the run in a folder has not ended, so that its weights may not be those that it will end with.
 fn note_unfinished(folder: &Path) {
     if is_unfinished(folder) {
         note(format_args!("{}: this run has not ended; these are its weights so far", folder.display()));

@@ -52,14 +52,14 @@ fn without_training(registry: &Registry, task: &str, policy: &str, seed: u64) ->
 }
 
 /// # Errors
-/// If there is a file that is no page, which would be lost, or cannot be read.
+/// If there is a file that is no replay, which would be lost, or cannot be read.
 fn refuse_other_file(path: &Path) -> Result<()> {
     let mut begins = Vec::new();
     if path.is_file() {
         let read = File::open(path).and_then(|file| file.take(9).read_to_end(&mut begins));
         read.map_err(Error::io("read", path))?;
     }
-    if begins.is_empty() || begins.eq_ignore_ascii_case(b"<!doctype") {
+    if begins.is_empty() || begins == b"<!doctype" {
         return Ok(());
     }
     Err(Error::Config(format!("{}: this file is not a replay; choose another --out", path.display())))

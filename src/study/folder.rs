@@ -223,7 +223,7 @@ pub(super) fn check_tables(folder: &Path) -> Result<()> {
 /// If there is none, or it is damaged.
 pub(super) fn read_config(folder: &Path) -> Result<(PathBuf, RunConfig)> {
     let path = folder.join(CONFIG);
-    if !path.try_exists().map_err(Error::io("read", &path))? {
+    if folder.is_file() || !path.try_exists().map_err(Error::io("read", &path))? {
         let advice = "there is no run; give a folder that has a config.toml, such as runs/quick/reach/sac/seed0";
         return Err(Error::Config(format!("cannot read {}: {advice}", folder.display())));
     }
@@ -323,6 +323,7 @@ pub(super) fn is_open(folder: &Path) -> bool {
 }
 
 /// Whether a folder holds a run that has begun and not ended.
+#[cfg(feature = "cli")]
 pub(crate) fn is_unfinished(folder: &Path) -> bool {
     folder.join(CHECKPOINT).exists() && !folder.join(SUMMARY).exists()
 }

@@ -30,6 +30,7 @@ pub use super::export::export;
 use super::folder::RunFolder;
 #[cfg(feature = "cli")]
 pub(crate) use super::folder::check_run;
+#[cfg(feature = "cli")]
 pub(crate) use super::folder::is_unfinished;
 pub use super::folder::{is_complete, read_summary};
 use super::records::{EpisodeRow, EvaluationRow, ModelRow, Progress, ValueRow};

@@ -73,7 +73,7 @@ pub struct SacConfig {
     /// a decision were one time step.
     #[doc(alias = "HER")]
     pub hindsight: f32,
-    /// Critic updates for each time step: the update-to-data ratio.
+    /// Critic updates for each time step. Times `action_repeat`, this is the update-to-data ratio: updates for each stored decision.
     #[doc(alias = "UTD")]
     pub updates_per_step: usize,
     /// Critic updates for each update of policy and temperature.

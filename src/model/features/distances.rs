@@ -51,6 +51,13 @@ impl Distances {
         2 * self.vectors.len()
     }
 
+    /// Appends the inputs of one observation.
+    pub fn push(&self, obs: &[f32], inputs: &mut Vec<f32>) {
+        let first = inputs.len();
+        self.push_scaled(obs, inputs);
+        self.squash(&mut inputs[first..]);
+    }
+
     /// Appends what [`Distances::squash`] turns into the inputs of one observation: each distance in units of its scale, twice.
     pub(crate) fn push_scaled(&self, obs: &[f32], scaled: &mut Vec<f32>) {
         for (components, scale) in &self.vectors {
@@ -128,8 +135,7 @@ mod tests {
         let way = world.spec().index_of("hand to goal x").expect("a difference");
         let (mut inputs, scale) = (Vec::new(), world.spec().observation[way].scale);
         let distances = Distances::new(world.spec());
-        distances.push_scaled(&obs, &mut inputs);
-        distances.squash(&mut inputs);
+        distances.push(&obs, &mut inputs);
         let length = obs[way..way + 3].iter().map(|x| x * x).sum::<f32>().sqrt() / scale;
         assert_eq!(inputs.len(), distances.width());
         assert!((inputs[0] - length.ln_1p()).abs() < 1e-6 && (inputs[1] - (NEAR * length).tanh()).abs() < 1e-6);

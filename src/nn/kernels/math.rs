@@ -38,7 +38,8 @@ pub fn softplus(x: f32) -> f32 {
     x.max(0.0) + ln_1p(exp(-x.abs()))
 }
 
-/// `sign(x) ln(1 + |x|)`: a logarithm for both signs (Hafner et al. 2023, arXiv v1, eq. 2), to 2e-7 of itself.
+/// `sign(x) ln(1 + |x|)`: a logarithm for both signs (Hafner et al. 2023, arXiv v1, eq. 2), to 3e-7 of itself (1e-6 above 2e38; of
+/// subnormal numbers, digits are lost).
 #[inline(always)]
 pub fn symlog(x: f32) -> f32 {
     // 1 + |x| = 2^n (1 + f) with 1 + f between the roots of 1/2 and 2, up to where 2^-n is a normal number.
@@ -50,7 +51,7 @@ pub fn symlog(x: f32) -> f32 {
     (if size < f32::INFINITY { log } else { size }).copysign(x)
 }
 
-/// ln(1 + f) for f from -0.3 to 1.
+/// ln(1 + f) for f from -0.3 to 1, and less exactly to 3.
 #[inline(always)]
 fn ln_1p(f: f32) -> f32 {
     // It is 2 artanh(f / (2 + f)); that by its series.
@@ -131,7 +132,7 @@ mod tests {
             for x in [i as f32 / 1000.0, 10_f32.powf(i as f32 / 1000.0)] {
                 let truth = f64::from(x).abs().ln_1p().copysign(x.into());
                 let error = (f64::from(symlog(x)) - truth).abs();
-                assert!(error <= 2e-7 * truth.abs(), "symlog({x}) is off by {error:e}");
+                assert!(error <= 3e-7 * truth.abs(), "symlog({x}) is off by {error:e}");
             }
         }
         assert_eq!(symlog(-f32::INFINITY), -f32::INFINITY);

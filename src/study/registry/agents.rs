@@ -1,6 +1,6 @@
 //! Registered agents.
 
-use toml::Table;
+use toml::{Table, Value};
 
 use super::Registry;
 use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, completed, in_range};
@@ -73,7 +73,7 @@ pub(super) struct AgentEntry {
     pub(super) complete: Complete,
     pub(super) check: Check,
     pub(super) choices: Vec<String>,
-    /// Settings without which trained weights would mean something else, even where all arrays keep their sizes.
+    /// Paths of the settings without which trained weights would mean something else, even where all arrays keep their sizes.
     trained_with: &'static [&'static str],
     #[allow(clippy::type_complexity)] // a closure's type, named once
     pub(super) make: Box<dyn Fn(&AgentContext, Table) -> Result<Method> + Send + Sync>,
@@ -109,20 +109,28 @@ impl AgentEntry {
     /// If settings differ that belong to the trained weights.
     pub(super) fn check_trained_with(&self, trained: &Table, changed: &Table) -> Result<()> {
         let [trained, changed] = [trained, changed].map(|settings| -> Table {
-            let of_weights = self.trained_with.iter().filter_map(|key| settings.get_key_value(*key));
-            of_weights.map(|(key, value)| (key.clone(), value.clone())).collect()
+            let of_weights = self.trained_with.iter();
+            of_weights.filter_map(|path| Some((path.to_string(), at(settings, path)?.clone()))).collect()
         });
         match difference_in(&format!("{}.", self.name), &trained, &changed) {
             None => Ok(()),
-            Some(difference) => Err(Error::Config(format!(
-                "the run's weights mean nothing with this setting ({difference}); leave it out"
-            ))),
+            Some(difference) => {
+                Err(Error::Config(format!("this setting belongs to the run's weights ({difference}); leave it out")))
+            }
         }
     }
 
     /// Its settings have ranges, which are checked before anything is made.
     fn with_ranges<C: Settings + Ranges>(self) -> Self {
         Self { check: in_range::<C>, ..self }
+    }
+}
+
+/// The value at a dotted path.
+fn at<'a>(settings: &'a Table, path: &str) -> Option<&'a Value> {
+    match path.split_once('.') {
+        Some((key, rest)) => at(settings.get(key)?.as_table()?, rest),
+        None => settings.get(path),
     }
 }
 
@@ -150,5 +158,5 @@ pub(super) fn register(registry: Registry) -> Registry {
         .add_agent(sac.with_ranges::<SacConfig>().trained_with(&["latent_features"]))
         .add_agent(dreamer.with_ranges::<DreamerConfig>().trained_with(&["world", "action_repeat"]))
         .add_agent(tdmpc2.with_ranges::<TdMpc2Config>().trained_with(&["model", "action_repeat", "reward_unit"]))
-        .add_agent(pets.with_ranges::<PetsConfig>().trained_with(&["ensemble", "action_repeat"]))
+        .add_agent(pets.with_ranges::<PetsConfig>().trained_with(&["ensemble.reward_unit", "action_repeat"]))
 }

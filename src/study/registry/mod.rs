@@ -287,7 +287,8 @@ impl Registry {
     }
 
     /// As [`Registry::trained_method`], but the method acts with the settings that `file` changes: with another planner, for
-    /// example, in the model that the run has learned. Settings that belong to the weights cannot change.
+    /// example, in the model that the run has learned. Settings that belong to the weights cannot change; those
+    /// of agents of one's own are checked only by the sizes of the weights.
     ///
     /// # Errors
     /// As [`Registry::trained_method`]; or if the file cannot be read, a field or value in it is wrong, or the weights do not fit

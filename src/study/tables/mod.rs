@@ -61,9 +61,9 @@ pub struct Tables {
 }
 
 impl Tables {
-    /// Reads the tables of a study from its folder. A run that has fewer rows than its configuration says, or another configuration
-    /// than the first with its task and method, is left out by name, as in [`Tables::gather`]; the runs of earlier versions, which
-    /// recorded no configuration, cannot be checked.
+    /// Reads the tables of a study from its folder. A run that has fewer rows than its configuration says, was tested on other
+    /// starts than it says, or has another configuration than the first with its task and method, is left out by name, as in
+    /// [`Tables::gather`]; the runs of earlier versions, which recorded no configuration, cannot be checked.
     ///
     /// # Errors
     /// If a table is missing or damaged, or lacks a run; if there is no whole run; or if the starts of the tests differ.

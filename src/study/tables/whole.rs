@@ -12,7 +12,8 @@ use super::{Tables, inside, numbers, strings};
 use crate::error::{Error, Result};
 
 impl Tables {
-    /// Leaves out the runs of which rows were lost, or that have another configuration than the first with their task and method.
+    /// Leaves out the runs of which rows were lost, that were tested on other starts than their configuration says, or that have
+    /// another configuration than the first with their task and method.
     ///
     /// # Errors
     /// If there is nothing but such runs, or a run is not in a table at all.
@@ -89,13 +90,15 @@ fn lost_rows(run: &Candidate, steps: Option<&Vec<i64>>, episodes: Option<&Vec<i6
     (usize::try_from(wanted) != Ok(there)).then(|| format!("its test in `tests.csv` has {there} of {wanted} episodes"))
 }
 
-/// Whether a table that has rows of this run's method lacks those of its last evaluation. `steps` are those of all runs.
+/// Whether a table lacks the rows of a run's last evaluation, which another run of its method has. `steps` are those of all runs.
 fn lost_end(run: &Candidate, file: &str, steps: &BTreeMap<RunName, Vec<i64>>) -> Option<String> {
     let Candidate { task, method, seed, .. } = run;
-    steps.keys().find(|(of_task, of_method, _)| (of_task, of_method) == (task, method))?;
-    let (last, budget) =
-        (steps.get(&(task.clone(), method.clone(), *seed)).and_then(|steps| steps.last()), run.number("steps")?);
-    (last != Some(&budget)).then(|| format!("its last evaluation, at step {budget}, is not in `{file}`"))
+    let budget = run.number("steps")?;
+    let at_end = |steps: &Vec<i64>| steps.last() == Some(&budget);
+    // An agent may have nothing to say of its last evaluation; then no run of it has.
+    steps.iter().find(|((of_task, of_method, _), steps)| (of_task, of_method) == (task, method) && at_end(steps))?;
+    let there = steps.get(&(task.clone(), method.clone(), *seed)).is_some_and(at_end);
+    (!there).then(|| format!("its last evaluation, at step {budget}, is not in `{file}`"))
 }
 
 /// Whether a run was tested on other starts than its configuration says. Where nothing is said, they are the test's.
