@@ -198,6 +198,9 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         let (success, ratio) = (success("lift", "lift", method), ratio("lift", method));
         quotes.push(("README.md", format!("| {name} | {success} | {steps} ({seeds}) | {ratio} | {sparc:.1} |")));
     }
+    let oracle = success("lift", "lift", "oracle");
+    let sparc = lift("oracle", "smoothness_sparc");
+    quotes.push(("README.md", format!("| oracle (plans on the true simulator) | {oracle} | - | - | {sparc:.1} |")));
     let [pets, learned] = ["pets", "pets-learned"].map(|method| success("lift", "lift", method));
     let dreamer = ["success", "success_low", "success_high"].map(|column| 100.0 * lift("dreamer", column));
     let [dreamer, low, high] = dreamer.map(|rate| format!("{rate:.0}"));
