@@ -1,4 +1,4 @@
-//! One table of settings over another.
+//! One table of settings over another, and values at dotted paths.
 
 use toml::{Table, Value};
 
@@ -25,15 +25,20 @@ fn merge_at(path: &str, base: &mut Table, over: Table, choices: &[String]) {
     }
 }
 
+/// The value at a dotted path.
+pub(crate) fn value_at<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+    match path.split_once('.') {
+        Some((key, rest)) => value_at(table.get(key)?.as_table()?, rest),
+        None => table.get(path),
+    }
+}
+
 /// # Errors
 /// If a table of `choices` names more variants than one, or none.
 pub(crate) fn check_choices(table: &Table, choices: &[String]) -> Result<()> {
     for path in choices {
-        let mut value = Some(table);
-        for part in path.split('.') {
-            value = value.and_then(|table| table.get(part)).and_then(Value::as_table);
-        }
-        if let Some(variants) = value.filter(|variants| variants.len() != 1) {
+        let variants = value_at(table, path).and_then(Value::as_table);
+        if let Some(variants) = variants.filter(|variants| variants.len() != 1) {
             let named: Vec<&str> = variants.keys().map(String::as_str).collect();
             let named = if named.is_empty() { "none".into() } else { shortened(&named.join(", "), 100) };
             return Err(Error::Config(format!("`{path}` is a choice, so name exactly one variant; it names {named}")));

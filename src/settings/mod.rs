@@ -22,7 +22,7 @@ use std::fmt::Debug;
 use std::ops::RangeInclusive;
 
 pub(crate) use choices::choices;
-pub(crate) use merge::{check_choices, merge};
+pub(crate) use merge::{check_choices, merge, value_at};
 
 use crate::error::{Error, Result};
 

@@ -355,6 +355,8 @@ fn a_cell_that_cannot_be_true_is_named() {
         ("evaluations.csv", "success", "", "it must be a number"),
         ("evaluations.csv", "step", "1e3", "a whole number"),
         ("evaluations.csv", "return_mean", "inf", "it must be finite"),
+        ("evaluations.csv", "seconds", "-1", "it must not be negative"),
+        ("evaluations.csv", "action_ms", "NaN", "it must be finite"),
         ("models.csv", "rmse", "small", "it must be a number"),
         ("models.csv", "coverage90", "1.5", "it must lie in [0, 1]"),
         ("values.csv", "correlation", "inf", "it must lie in [-1, 1]"),

@@ -13,6 +13,7 @@ use super::{EnsembleConfig, MIN_STD};
 use crate::checkpoint::Weights;
 use crate::env::{KnownReward, Spec};
 use crate::error::Result;
+use crate::model::features::push_row;
 use crate::model::{Distances, LatentFeatures, Normaliser};
 use crate::nn::GroupLasso;
 use crate::nn::frozen::{Feature, FrozenMlp, PANEL, Panels};
@@ -128,9 +129,7 @@ impl Inputs {
 
     /// Appends the inputs of a transition: observation, action, next observation.
     fn push(&self, transition: [&[f32]; 3], inputs: &mut Vec<f32>) {
-        let first = inputs.len();
-        self.push_scaled(transition, inputs);
-        self.squash(&mut inputs[first..]);
+        push_row(inputs, |inputs| self.push_scaled(transition, inputs), |row| self.squash(row));
     }
 
     /// Writes the inputs of some transitions to a panel.

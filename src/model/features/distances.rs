@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::squash;
+use super::{push_row, squash};
 use crate::env::{Role, Spec};
 
 /// The distances in an observation, such as that from the hand to a cube: the lengths of its displacement vectors.
@@ -53,9 +53,7 @@ impl Distances {
 
     /// Appends the inputs of one observation.
     pub fn push(&self, obs: &[f32], inputs: &mut Vec<f32>) {
-        let first = inputs.len();
-        self.push_scaled(obs, inputs);
-        self.squash(&mut inputs[first..]);
+        push_row(inputs, |inputs| self.push_scaled(obs, inputs), |row| self.squash(row));
     }
 
     /// Appends what [`Distances::squash`] turns into the inputs of one observation: each distance in units of its scale, twice.

@@ -2,7 +2,7 @@
 
 use dfdx::tensor::Cpu;
 
-use super::{Cube, squash};
+use super::{Cube, push_row, squash};
 use crate::env::{Role, Spec};
 use crate::nn::two_hot::symexp;
 use crate::nn::{Tensor3, tensor, values};
@@ -83,9 +83,7 @@ impl LatentFeatures {
 
     /// Appends the encoder inputs of one observation.
     pub(crate) fn push(&self, obs: &[f32], inputs: &mut Vec<f32>) {
-        let first = inputs.len();
-        self.push_scaled(obs, inputs);
-        self.squash(&mut inputs[first..]);
+        push_row(inputs, |inputs| self.push_scaled(obs, inputs), |row| self.squash(row));
     }
 
     /// Appends what [`LatentFeatures::squash`] turns into the encoder inputs of one observation.

@@ -37,6 +37,17 @@ pub use normaliser::Normaliser;
 use self::feature_map::NEAR;
 use crate::nn::kernels::{symlog, tanh, vectorised_fn};
 
+/// Appends one row of network inputs: `push_scaled` appends scaled features, which `squash` turns into inputs in place.
+pub(crate) fn push_row(
+    inputs: &mut Vec<f32>,
+    push_scaled: impl FnOnce(&mut Vec<f32>),
+    squash: impl FnOnce(&mut [f32]),
+) {
+    let first = inputs.len();
+    push_scaled(inputs);
+    squash(&mut inputs[first..]);
+}
+
 vectorised_fn! {
     /// Turns scaled features into network inputs, in place: `raw` through symlog, `near` through the tanh.
     fn squash(raw: &'a mut [f32], near: &'a mut [f32]) {

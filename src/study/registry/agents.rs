@@ -1,6 +1,6 @@
 //! Registered agents.
 
-use toml::{Table, Value};
+use toml::Table;
 
 use super::Registry;
 use super::envs::{Check, Complete, ErasedEnv, NoOptions, Settings, completed, in_range};
@@ -9,7 +9,7 @@ use crate::agent::{
 };
 use crate::env::{Env, SharedReward, Spec};
 use crate::error::{Error, Result};
-use crate::settings::{Ranges, choices};
+use crate::settings::{Ranges, choices, value_at};
 use crate::study::folder::difference_in;
 
 /// What an agent is made from, beside its settings.
@@ -110,7 +110,7 @@ impl AgentEntry {
     pub(super) fn check_trained_with(&self, trained: &Table, changed: &Table) -> Result<()> {
         let [trained, changed] = [trained, changed].map(|settings| -> Table {
             let of_weights = self.trained_with.iter();
-            of_weights.filter_map(|path| Some((path.to_string(), at(settings, path)?.clone()))).collect()
+            of_weights.filter_map(|path| Some((path.to_string(), value_at(settings, path)?.clone()))).collect()
         });
         match difference_in(&format!("{}.", self.name), &trained, &changed) {
             None => Ok(()),
@@ -123,14 +123,6 @@ impl AgentEntry {
     /// Its settings have ranges, which are checked before anything is made.
     fn with_ranges<C: Settings + Ranges>(self) -> Self {
         Self { check: in_range::<C>, ..self }
-    }
-}
-
-/// The value at a dotted path.
-fn at<'a>(settings: &'a Table, path: &str) -> Option<&'a Value> {
-    match path.split_once('.') {
-        Some((key, rest)) => at(settings.get(key)?.as_table()?, rest),
-        None => settings.get(path),
     }
 }
 

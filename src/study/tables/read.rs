@@ -27,6 +27,8 @@ enum Cell {
     Share,
     /// A finite number.
     Number,
+    /// A finite number from 0 on.
+    Magnitude,
     /// What is not always there: nothing, or any number. A movement that never began has no smoothness, the error of a model
     /// that diverged is infinite.
     Measure,
@@ -66,19 +68,19 @@ pub(super) const EVALUATIONS: TableFormat = TableFormat {
         ("episodes", MANY, Always),
         ("success", Cell::Share, Always),
         ("return_mean", Cell::Number, Optional),
-        ("return_std", Cell::Number, Optional),
+        ("return_std", Cell::Magnitude, Optional),
         ("smoothness_sparc", Cell::Measure, Optional),
         ("smoothness_ldlj", Cell::Measure, Optional),
-        ("action_ms", Cell::Number, Optional),
+        ("action_ms", Cell::Magnitude, Optional),
         ("updates", MANY, Optional),
-        ("seconds", Cell::Number, Optional),
+        ("seconds", Cell::Magnitude, Optional),
     ],
     order: &["step"],
     counts: false,
 };
 
 pub(super) const EPISODES: TableFormat = TableFormat {
-    columns: &[("step", MANY, Always), ("seconds", Cell::Number, Always)],
+    columns: &[("step", MANY, Always), ("seconds", Cell::Magnitude, Always)],
     order: &["step"],
     counts: false,
 };
@@ -236,7 +238,9 @@ impl Cells {
             Cell::Name | Cell::Starts | Cell::Text => Self::Text(cell, Vec::new()),
             Cell::Count(limit) => Self::Whole(limit, Vec::new()),
             Cell::Flag => Self::Flags(Vec::new()),
-            Cell::Share | Cell::Number | Cell::Measure | Cell::Within(..) => Self::Numbers(cell, Vec::new()),
+            Cell::Share | Cell::Number | Cell::Magnitude | Cell::Measure | Cell::Within(..) => {
+                Self::Numbers(cell, Vec::new())
+            }
         }
     }
 
@@ -270,7 +274,8 @@ impl Cells {
                     Cell::Within(low, high) if number < *low - ROUNDING || number > *high + ROUNDING => {
                         return Err(format!("it must lie in [{low}, {high}]"));
                     }
-                    Cell::Number if !number.is_finite() => return Err("it must be finite".into()),
+                    Cell::Number | Cell::Magnitude if !number.is_finite() => return Err("it must be finite".into()),
+                    Cell::Magnitude if number < 0.0 => return Err("it must not be negative".into()),
                     _ => numbers.push(Some(number)),
                 }
             }

@@ -8,6 +8,7 @@ use polars::prelude::*;
 use super::{Tables, inside, numbers, strings};
 use crate::agent::method_names;
 use crate::error::{Error, Result, shortened};
+use crate::settings::value_at;
 use crate::study::config::upgrade_keys;
 use crate::study::folder::difference;
 
@@ -124,15 +125,14 @@ impl Tables {
 
 /// Whether a run with these settings has the reward as a function. None for agents that are not ours.
 fn is_told(settings: &toml::Table, method: &str) -> Option<bool> {
-    let of = |path: &[&str]| path.iter().try_fold(settings, |table, name| table.get(*name)?.as_table());
     match settings.get("agent").and_then(toml::Value::as_str) {
         Some("oracle") => Some(true),
         Some("pets") => {
-            let learns = of(&["pets", "ensemble"]).and_then(|table| table.get("learn_reward")?.as_bool());
+            let learns = value_at(settings, "pets.ensemble.learn_reward").and_then(toml::Value::as_bool);
             Some(!learns.unwrap_or(false))
         }
         Some("sac") => {
-            let relabelled = of(&["sac"]).and_then(|table| table.get("hindsight")?.as_float());
+            let relabelled = value_at(settings, "sac.hindsight").and_then(toml::Value::as_float);
             Some(relabelled.unwrap_or(0.0) > 0.0)
         }
         Some("random" | "scripted" | "dreamer" | "tdmpc2") => Some(false),
@@ -156,28 +156,28 @@ pub(super) fn check_runs(tables: &Tables) -> Result<()> {
         return Err(Error::Config("the study has no test episode: there is nothing to report".into()));
     }
     let others = [
-        ("models", &tables.models),
-        ("values", &tables.values),
-        ("runs", &tables.runs),
-        ("evaluations", &tables.evaluations),
+        ("models.csv", &tables.models),
+        ("values.csv", &tables.values),
+        ("runs.csv", &tables.runs),
+        ("evaluations.csv", &tables.evaluations),
     ];
     for (file, table) in others {
         if let Some(run) = names(table)?.difference(&tested).next() {
-            return Err(incomplete(run, &format!("tests.csv, but in its {file}.csv")));
+            return Err(incomplete(run, "tests.csv", file));
         }
     }
     let learns = |(task, method, _): &&RunName| evaluated.iter().any(|(of, other, _)| (of, other) == (task, method));
     match tested.difference(&evaluated).find(learns) {
-        Some(run) => Err(incomplete(run, "evaluations.csv")),
+        Some(run) => Err(incomplete(run, "evaluations.csv", "tests.csv")),
         None => Ok(()),
     }
 }
 
-/// For a run that is not in a table which has to have it.
-pub(super) fn incomplete((task, method, seed): &RunName, file: &str) -> Error {
+/// For a run that is in one table of a study, but not in another which has to have it.
+pub(super) fn incomplete((task, method, seed): &RunName, absent: &str, present: &str) -> Error {
     Error::Config(format!(
-        "the study is incomplete: `{method}` on `{task}` with seed {seed} is not in its {file}; \
-         restore that table, or make those of the study anew"
+        "the study is incomplete: `{method}` on `{task}` with seed {seed} is not in its {absent}, but in its {present}; \
+         restore {absent}, or make the tables of the study anew"
     ))
 }
 

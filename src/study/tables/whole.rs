@@ -54,16 +54,17 @@ impl Tables {
         let (mut admission, mut objections) = (Admission::default(), Vec::new());
         for name in run_names(&self.tests).map_err(inside)? {
             if !names.contains(&name) {
-                return Err(incomplete(&name, "runs.csv"));
+                return Err(incomplete(&name, "runs.csv", "tests.csv"));
             }
             let (task, method, seed) = name.clone();
-            let run = Candidate { task, method, seed, starts: String::new(), settings: settings.remove(&name) };
+            let starts = starts.get(&name).cloned().unwrap_or_default();
+            let run = Candidate { task, method, seed, starts, settings: settings.remove(&name) };
             if run.number("steps").is_some_and(|steps| steps > 0) && !steps.contains_key(&name) {
-                return Err(incomplete(&name, "evaluations.csv"));
+                return Err(incomplete(&name, "evaluations.csv", "tests.csv"));
             }
             let lost = lost_rows(&run, steps.get(&name), episodes.get(&name))
                 .or_else(|| evaluated.iter().find_map(|(file, steps)| lost_end(&run, file, steps)))
-                .or_else(|| other_starts(&run, starts.get(&name)));
+                .or_else(|| other_starts(&run));
             match lost.or_else(|| admission.objection(&run).map(|objection| format!("it {objection}"))) {
                 Some(reason) => objections.push((name, reason)),
                 None => admission.admit(&run),
@@ -102,9 +103,9 @@ fn lost_end(run: &Candidate, file: &str, steps: &BTreeMap<RunName, Vec<i64>>) ->
 }
 
 /// Whether a run was tested on other starts than its configuration says. Where nothing is said, they are the test's.
-fn other_starts(run: &Candidate, tested: Option<&String>) -> Option<String> {
+fn other_starts(run: &Candidate) -> Option<String> {
     let said = run.settings.as_ref()?.get("starts").and_then(toml::Value::as_str).unwrap_or("test");
-    let tested = tested.map_or("test", String::as_str);
+    let tested = if run.starts.is_empty() { "test" } else { &run.starts };
     (said != tested).then(|| {
         format!("its configuration says that it is tested on the starts `{said}`, `tests.csv` says `{tested}`")
     })
