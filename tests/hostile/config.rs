@@ -3,6 +3,8 @@
 use std::cell::Cell;
 use std::collections::BTreeSet;
 
+use handful::agent::{PetsConfig, Preset};
+use handful::model::uncertainty::Risk;
 use handful::plan::PlannerConfig;
 use handful::prelude::*;
 use handful::study::config::RunConfig;
@@ -284,6 +286,9 @@ fn a_file_can_choose_any_planner() {
         let config = config_of("pets", &format!("pets.risk = {risk}\n[for.reach.pets]\nrisk = {{ cvar = 0.25 }}"));
         assert_eq!(config.expect(risk).settings["risk"]["cvar"].as_float(), Some(0.25));
     }
+    // Also where a preset replaces that of its base.
+    let risk = |method: &str| PetsConfig::preset_for(method, "lift").expect("a preset").risk;
+    assert_eq!([risk("pets"), risk("pets-learned")], [Risk::MeanStd(1.0), Risk::Neutral]);
     let problem = config_of("pets", "pets.planner = { cem = {}, mppi = {} }").expect_err("two planners").to_string();
     assert!(problem.contains("`pets.planner`") && problem.contains("cem, mppi"), "{problem}");
 }

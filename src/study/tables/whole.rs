@@ -47,7 +47,7 @@ impl Tables {
         let names: BTreeSet<RunName> = names.into_iter().collect();
         let steps = numbers_of_each(&self.evaluations, "step").map_err(inside)?;
         let episodes = numbers_of_each(&self.tests, "episode").map_err(inside)?;
-        let starts = starts_of_each(&self.tests).map_err(inside)?;
+        let starts_of = starts_of_each(&self.tests).map_err(inside)?;
         let evaluated = [("values.csv", &self.values), ("models.csv", &self.models)];
         let evaluated = evaluated.map(|(file, table)| Ok((file, numbers_of_each(table, "step").map_err(inside)?)));
         let evaluated = evaluated.into_iter().collect::<Result<Vec<_>>>()?;
@@ -57,7 +57,7 @@ impl Tables {
                 return Err(incomplete(&name, "runs.csv", "tests.csv"));
             }
             let (task, method, seed) = name.clone();
-            let starts = starts.get(&name).cloned().unwrap_or_default();
+            let starts = starts_of.get(&name).cloned().unwrap_or_default();
             let run = Candidate { task, method, seed, starts, settings: settings.remove(&name) };
             if run.number("steps").is_some_and(|steps| steps > 0) && !steps.contains_key(&name) {
                 return Err(incomplete(&name, "evaluations.csv", "tests.csv"));
