@@ -11,7 +11,7 @@ use crate::study::names::{NAME_RULE, check_name, excerpt};
 use crate::study::starts::{LIMIT, Starts};
 
 /// What a cell holds.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 enum Cell {
     /// The name of a task or method.
     Name,
@@ -61,6 +61,10 @@ const LABELS: [(&str, Cell, Need); 3] =
 const ROUNDING: f64 = 1e-9;
 /// More than any run counts, and few enough for a float.
 const MANY: Cell = Cell::Count(1 << 53);
+/// As [`Cell::Measure`], for what has no sign.
+const NON_NEGATIVE: Cell = Cell::Within(0.0, f64::INFINITY);
+/// Why a number below 0 is refused.
+const NEGATIVE: &str = "it must not be negative";
 
 pub(super) const EVALUATIONS: TableFormat = TableFormat {
     columns: &[
@@ -89,10 +93,10 @@ pub(super) const MODELS: TableFormat = TableFormat {
     columns: &[
         ("step", MANY, Always),
         ("horizon", MANY, Always),
-        ("rmse", Cell::Within(0.0, f64::INFINITY), Always),
+        ("rmse", NON_NEGATIVE, Always),
         ("nll", Cell::Measure, Optional),
         ("coverage90", Cell::Within(0.0, 1.0), Always),
-        ("rmse_p90", Cell::Within(0.0, f64::INFINITY), Optional),
+        ("rmse_p90", NON_NEGATIVE, Optional),
     ],
     order: &["step", "horizon"],
     counts: false,
@@ -103,7 +107,7 @@ pub(super) const VALUES: TableFormat = TableFormat {
         ("step", MANY, Always),
         ("expected", Cell::Measure, Always),
         ("realised", Cell::Measure, Always),
-        ("rmse", Cell::Within(0.0, f64::INFINITY), Optional),
+        ("rmse", NON_NEGATIVE, Optional),
         ("correlation", Cell::Within(-1.0, 1.0), Always),
     ],
     order: &["step"],
@@ -119,7 +123,7 @@ pub(super) const TESTS: TableFormat = TableFormat {
         ("stage", MANY, Optional),
         ("sparc", Cell::Measure, Always),
         ("ldlj", Cell::Measure, Always),
-        ("action_change", Cell::Within(0.0, f64::INFINITY), Optional),
+        ("action_change", NON_NEGATIVE, Optional),
         ("starts", Cell::Starts, Optional),
     ],
     order: &["episode"],
@@ -269,13 +273,13 @@ impl Cells {
             Self::Numbers(Cell::Measure | Cell::Within(..), numbers) if text.is_empty() => numbers.push(None),
             Self::Numbers(cell, numbers) => {
                 let number: f64 = text.parse().map_err(|_| "it must be a number")?;
-                match cell {
+                match *cell {
                     Cell::Share if !(0.0..=1.0).contains(&number) => return Err("it must lie in [0, 1]".into()),
-                    Cell::Within(low, high) if number < *low - ROUNDING || number > *high + ROUNDING => {
+                    Cell::Magnitude | NON_NEGATIVE if number < 0.0 => return Err(NEGATIVE.into()),
+                    Cell::Within(low, high) if number < low - ROUNDING || number > high + ROUNDING => {
                         return Err(format!("it must lie in [{low}, {high}]"));
                     }
                     Cell::Number | Cell::Magnitude if !number.is_finite() => return Err("it must be finite".into()),
-                    Cell::Magnitude if number < 0.0 => return Err("it must not be negative".into()),
                     _ => numbers.push(Some(number)),
                 }
             }
