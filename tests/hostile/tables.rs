@@ -359,6 +359,8 @@ fn a_cell_that_cannot_be_true_is_named() {
         ("evaluations.csv", "return_std", "-1", "it must not be negative"),
         ("evaluations.csv", "action_ms", "NaN", "it must be finite"),
         ("models.csv", "rmse", "-1", "it must not be negative"),
+        ("models.csv", "rmse_p90", "-1", "it must not be negative"),
+        ("values.csv", "rmse", "-1", "it must not be negative"),
         ("tests.csv", "action_change", "-1", "it must not be negative"),
         ("models.csv", "rmse", "small", "it must be a number"),
         ("models.csv", "coverage90", "1.5", "it must lie in [0, 1]"),

@@ -11,7 +11,7 @@ use crate::study::names::{NAME_RULE, check_name, excerpt};
 use crate::study::starts::{LIMIT, Starts};
 
 /// What a cell holds.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug)]
 enum Cell {
     /// The name of a task or method.
     Name,
@@ -32,7 +32,9 @@ enum Cell {
     /// What is not always there: nothing, or any number. A movement that never began has no smoothness, the error of a model
     /// that diverged is infinite.
     Measure,
-    /// The same, but a number lies between these two, apart from rounding.
+    /// The same, but no number below 0.
+    Distance,
+    /// The same as a measure, but a number lies between these two, apart from rounding.
     Within(f64, f64),
 }
 
@@ -61,10 +63,6 @@ const LABELS: [(&str, Cell, Need); 3] =
 const ROUNDING: f64 = 1e-9;
 /// More than any run counts, and few enough for a float.
 const MANY: Cell = Cell::Count(1 << 53);
-/// As [`Cell::Measure`], for what has no sign.
-const NON_NEGATIVE: Cell = Cell::Within(0.0, f64::INFINITY);
-/// Why a number below 0 is refused.
-const NEGATIVE: &str = "it must not be negative";
 
 pub(super) const EVALUATIONS: TableFormat = TableFormat {
     columns: &[
@@ -93,10 +91,10 @@ pub(super) const MODELS: TableFormat = TableFormat {
     columns: &[
         ("step", MANY, Always),
         ("horizon", MANY, Always),
-        ("rmse", NON_NEGATIVE, Always),
+        ("rmse", Cell::Distance, Always),
         ("nll", Cell::Measure, Optional),
         ("coverage90", Cell::Within(0.0, 1.0), Always),
-        ("rmse_p90", NON_NEGATIVE, Optional),
+        ("rmse_p90", Cell::Distance, Optional),
     ],
     order: &["step", "horizon"],
     counts: false,
@@ -107,7 +105,7 @@ pub(super) const VALUES: TableFormat = TableFormat {
         ("step", MANY, Always),
         ("expected", Cell::Measure, Always),
         ("realised", Cell::Measure, Always),
-        ("rmse", NON_NEGATIVE, Optional),
+        ("rmse", Cell::Distance, Optional),
         ("correlation", Cell::Within(-1.0, 1.0), Always),
     ],
     order: &["step"],
@@ -123,7 +121,7 @@ pub(super) const TESTS: TableFormat = TableFormat {
         ("stage", MANY, Optional),
         ("sparc", Cell::Measure, Always),
         ("ldlj", Cell::Measure, Always),
-        ("action_change", NON_NEGATIVE, Optional),
+        ("action_change", Cell::Distance, Optional),
         ("starts", Cell::Starts, Optional),
     ],
     order: &["episode"],
@@ -242,7 +240,7 @@ impl Cells {
             Cell::Name | Cell::Starts | Cell::Text => Self::Text(cell, Vec::new()),
             Cell::Count(limit) => Self::Whole(limit, Vec::new()),
             Cell::Flag => Self::Flags(Vec::new()),
-            Cell::Share | Cell::Number | Cell::Magnitude | Cell::Measure | Cell::Within(..) => {
+            Cell::Share | Cell::Number | Cell::Magnitude | Cell::Measure | Cell::Distance | Cell::Within(..) => {
                 Self::Numbers(cell, Vec::new())
             }
         }
@@ -270,12 +268,16 @@ impl Cells {
                 "false" => false,
                 _ => return Err("it must be `true` or `false`".into()),
             }),
-            Self::Numbers(Cell::Measure | Cell::Within(..), numbers) if text.is_empty() => numbers.push(None),
+            Self::Numbers(Cell::Measure | Cell::Distance | Cell::Within(..), numbers) if text.is_empty() => {
+                numbers.push(None)
+            }
             Self::Numbers(cell, numbers) => {
                 let number: f64 = text.parse().map_err(|_| "it must be a number")?;
                 match *cell {
                     Cell::Share if !(0.0..=1.0).contains(&number) => return Err("it must lie in [0, 1]".into()),
-                    Cell::Magnitude | NON_NEGATIVE if number < 0.0 => return Err(NEGATIVE.into()),
+                    Cell::Magnitude | Cell::Distance if number < 0.0 => {
+                        return Err("it must not be negative".into());
+                    }
                     Cell::Within(low, high) if number < low - ROUNDING || number > high + ROUNDING => {
                         return Err(format!("it must lie in [{low}, {high}]"));
                     }
