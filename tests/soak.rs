@@ -103,12 +103,17 @@ fn outcome(mut child: Child, mut signal: Option<(&str, Instant)>) -> (ExitStatus
     (output.status, String::from_utf8_lossy(&output.stderr).into_owned())
 }
 
-/// All results in a folder and those below: weights, and tables without running times. Checkpoints have times in them.
+/// All results in a folder and those below: weights, and tables without running times. Checkpoints have times in them. Next to a study's
+/// tables, and among its recordings, the temporary files of a killed process stay for an hour, because they might be another's.
 fn results(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
+    let shared = folder.ends_with("replays") || folder.join("replays.csv").exists();
     for entry in fs::read_dir(folder).expect("a folder") {
         let path = entry.expect("an entry").path();
         let name = path.file_name().and_then(|name| name.to_str()).expect("a name").to_string();
+        if shared && name.starts_with(".handful-") {
+            continue;
+        }
         if path.is_dir() {
             let below = if name == "checkpoint" { BTreeMap::new() } else { results(&path) };
             found.extend(below.into_iter().map(|(file, bytes)| (Path::new(&name).join(file), bytes)));

@@ -23,6 +23,8 @@ use crate::files;
 use crate::watch::Recording;
 
 const TABLE: &str = "replays.csv";
+/// Where the recordings are, beside the table.
+pub(super) const FOLDER: &str = "replays";
 const COLUMNS: [&str; 8] = ["task", "method", "seed", "which", "episode", "return", "success", "file"];
 /// More bytes than a recording has when it is unpacked.
 const LARGEST: u64 = 1 << 28;
@@ -161,7 +163,7 @@ fn read(folder: &Path) -> Result<Vec<Replay>> {
 fn check(replay: &Replay) -> Result<()> {
     check_name("a task", &replay.task)?;
     check_name("a method", &replay.method)?;
-    let name = replay.file.strip_prefix("replays/").and_then(|file| file.strip_suffix(".json.gz"));
+    let name = replay.file.strip_prefix(FOLDER).and_then(|file| file.strip_prefix('/')?.strip_suffix(".json.gz"));
     let plain = |name: &str| name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
     if name.is_some_and(|name| !name.is_empty() && plain(name)) {
         return Ok(());
@@ -315,7 +317,7 @@ fn chosen(runs: &[(RunConfig, PathBuf)]) -> Vec<(Replay, &Path)> {
                 episode: order[at] + 1,
                 total: result.total,
                 success: result.success,
-                file: format!("replays/{}-{}-{name}.json.gz", config.task, config.method),
+                file: format!("{FOLDER}/{}-{}-{name}.json.gz", config.task, config.method),
             };
             episodes.push((replay, folder));
         }

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
+use std::time::{Duration, SystemTime};
 
 use handful::study::tables::Tables;
 use handful::study::{replays, report};
@@ -103,6 +104,24 @@ fn a_run_that_is_not_whole_is_left_out_by_name() {
     edit(&none, "tests.csv", last_line_less);
     let said = Tables::read(none.path()).expect_err("no whole run").to_string();
     assert!(said.contains("no run can be reported; `debug` on `pole` with seed 1: its test in"), "{said}");
+}
+
+/// What was written a minute ago may be another process's that is still writing.
+#[test]
+fn a_report_removes_what_killed_processes_left_long_ago() {
+    let folder = study(&ALL, "test");
+    fs::create_dir(folder.path().join("replays")).expect("a writable folder");
+    let temporary = |name: &str, age: u64| {
+        let path = folder.path().join(name);
+        let written = SystemTime::now() - Duration::from_secs(age);
+        fs::File::create(&path).and_then(|file| file.set_modified(written)).expect("a writable folder");
+        path
+    };
+    let old = [".handful-a1B2c3", "replays/.handful-a1B2c3"].map(|name| temporary(name, 7200));
+    let young = [".handful-d4E5f6", "replays/.handful-d4E5f6"].map(|name| temporary(name, 60));
+    report::write(folder.path(), folder.path()).expect("a report");
+    assert!(!old.iter().any(|file| file.exists()));
+    assert!(young.iter().all(|file| file.exists()));
 }
 
 /// Without the column, the tests would count as those on the test's starts.

@@ -44,7 +44,9 @@ pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String))
     for (run, reason) in tables.missing_runs()? {
         note(format!("left out: {} ({})", shortened(&run, 200), shortened(&reason, 300)));
     }
-    files::sweep(to, ABANDONED);
+    for folder in [to, &to.join(replays::FOLDER)] {
+        files::sweep(folder, ABANDONED);
+    }
     tables.write_summary(to)?;
     let pairs = tables.tasks_and_methods()?;
     let mut tasks: Vec<&str> = Vec::new();
