@@ -4,6 +4,8 @@
 pub const LARGEST: f64 = 1e100;
 /// The narrowest range, as a share of its larger end: a narrower one has no room for different ticks.
 const NARROWEST: f64 = 1e-9;
+/// The most labels on a logarithmic axis.
+const LABELS: usize = 8;
 /// How far outside of the frame a point is drawn, in lengths of the axis. A dashed line to a point much farther away would
 /// take plotters hours.
 const FARTHEST: f64 = 10.0;
@@ -28,6 +30,25 @@ impl Axis {
         let usable = |[low, high]: &[f64; 2]| fits(*low, log) && fits(*high, log) && is_wide(*low, *high);
         let [low, high] = asked.filter(usable).or_else(|| span(numbers, log))?;
         Some(Self { low, high, log })
+    }
+
+    /// The numbers at a logarithmic axis: powers of ten and, if there is room, two and five times these, or all their multiples.
+    pub fn log_labels(self) -> Vec<f64> {
+        let [low, high] = [self.low.min(self.high), self.low.max(self.high)];
+        // A little wider, because powers of ten are rounded.
+        let inside = |label: &f64| (low * (1.0 - NARROWEST)..=high * (1.0 + NARROWEST)).contains(label);
+        let decades = || low.log10().floor() as i32..=high.log10().ceil() as i32;
+        for multiples in [(1..10).collect(), vec![1, 2, 5]] {
+            let labels =
+                decades().flat_map(|power| multiples.iter().map(move |times| f64::from(*times) * 10_f64.powi(power)));
+            let labels: Vec<f64> = labels.filter(inside).collect();
+            if labels.len() <= LABELS {
+                return labels;
+            }
+        }
+        let powers: Vec<f64> = decades().map(|power| 10_f64.powi(power)).filter(inside).collect();
+        let step = powers.len().div_ceil(LABELS);
+        powers.into_iter().step_by(step).collect()
     }
 
     /// Where a point is drawn: where it is, unless that is far outside of the frame.
@@ -83,6 +104,17 @@ mod tests {
         assert_eq!(of(None, &[1e16, 1e16 + 2.0], false), Some([0.9e16, 1.1e16 + 2.0]));
         assert_eq!(of(None, &[1e300, f64::NAN], false), None);
         assert_eq!(of(None, &[0.0, -1.0, 5e-324], true), None);
+    }
+
+    #[test]
+    fn a_logarithmic_axis_has_labels() {
+        let labels = |low, high| Axis { low, high, log: true }.log_labels();
+        assert_eq!(labels(0.3, 4.5), [0.5, 1.0, 2.0]);
+        assert_eq!(labels(4.5, 0.3), [0.5, 1.0, 2.0], "reversed");
+        assert_eq!(labels(60.0, 100.0), [60.0, 70.0, 80.0, 90.0, 100.0]);
+        assert_eq!(labels(1.0, 200.0), [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0]);
+        assert_eq!(labels(0.5, 2e4), [1.0, 10.0, 100.0, 1e3, 1e4]);
+        assert!((5..=8).contains(&labels(1.0 / LARGEST, LARGEST).len()));
     }
 
     #[test]

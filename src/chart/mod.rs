@@ -21,6 +21,9 @@ mod axis;
 mod draw;
 mod panels;
 
+use std::ops::Range;
+
+use plotters::coord::combinators::BindKeyPoints;
 use plotters::prelude::*;
 
 use crate::error::{Error, Result};
@@ -231,11 +234,12 @@ impl Chart {
             return Err(Error::Config("chart: there is nothing to draw".into()));
         };
         let [across, up] = [x, y].map(|Axis { low, high, .. }| low..high);
+        let logarithmic = |range: Range<f64>, axis: Axis| range.log_scale().with_key_points(axis.log_labels());
         let drawn = match (x.log, y.log) {
             (false, false) => self.draw(area, frame, [x, y], across, up),
-            (true, false) => self.draw(area, frame, [x, y], across.log_scale(), up),
-            (false, true) => self.draw(area, frame, [x, y], across, up.log_scale()),
-            (true, true) => self.draw(area, frame, [x, y], across.log_scale(), up.log_scale()),
+            (true, false) => self.draw(area, frame, [x, y], logarithmic(across, x), up),
+            (false, true) => self.draw(area, frame, [x, y], across, logarithmic(up, y)),
+            (true, true) => self.draw(area, frame, [x, y], logarithmic(across, x), logarithmic(up, y)),
         };
         drawn.map_err(draw::failed)
     }
