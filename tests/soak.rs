@@ -103,23 +103,26 @@ fn outcome(mut child: Child, mut signal: Option<(&str, Instant)>) -> (ExitStatus
     (output.status, String::from_utf8_lossy(&output.stderr).into_owned())
 }
 
-/// All results in a folder and those below: weights, and tables without running times. Checkpoints have times in them. Next to a study's
-/// tables, and among its recordings, the temporary files of a killed process stay for an hour, because they might be another's.
-fn results(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+/// All results in a folder and those below: weights, figures, and tables without running times. Checkpoints and profiles have times in
+/// them. Next to a study's tables, and among its recordings, the temporary files of a killed process stay for an hour, because they might
+/// be another's.
+fn results(folder: &Path, killed: bool) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     let shared = folder.ends_with("replays") || folder.join("replays.csv").exists();
     for entry in fs::read_dir(folder).expect("a folder") {
         let path = entry.expect("an entry").path();
         let name = path.file_name().and_then(|name| name.to_str()).expect("a name").to_string();
         if shared && name.starts_with(".handful-") {
+            assert!(killed, "{}: left behind", path.display());
             continue;
         }
         if path.is_dir() {
-            let below = if name == "checkpoint" { BTreeMap::new() } else { results(&path) };
+            let below = if name == "checkpoint" { BTreeMap::new() } else { results(&path, killed) };
             found.extend(below.into_iter().map(|(file, bytes)| (Path::new(&name).join(file), bytes)));
         } else if name.ends_with(".csv") {
             found.insert(name.into(), without_times(&fs::read_to_string(&path).expect("a table")).into());
         } else if !["summary.toml", "report.md", "report.html", "events.out.tfevents.handful"].contains(&name.as_str())
+            && !name.ends_with("-profile.svg")
         {
             found.insert(name.into(), fs::read(&path).expect("a file"));
         }
@@ -159,7 +162,7 @@ fn killed_runs_end_as_if_nothing_had_happened() {
             let began = Instant::now();
             let (status, said) = outcome(job.start(), None);
             assert!(status.success(), "{args:?}: {said}");
-            let whole = (results(&job.folder), began.elapsed());
+            let whole = (results(&job.folder, false), began.elapsed());
             fs::remove_dir_all(&job.folder).expect("a writable folder");
             whole
         })
@@ -172,7 +175,7 @@ fn killed_runs_end_as_if_nothing_had_happened() {
             let sent = job.harassed(took.mul_f64(0.5), &mut rng);
             println!("{}: {sent:?}", args[..5].join(" "));
             sent.into_iter().for_each(|signal| *signals.entry(signal).or_default() += 1);
-            let killed = results(&job.folder);
+            let killed = results(&job.folder, true);
             assert_eq!(killed.keys().collect::<Vec<_>>(), whole.keys().collect::<Vec<_>>(), "{args:?}");
             for (file, bytes) in whole {
                 assert!(&killed[file] == bytes, "{args:?}: {} differs", file.display());

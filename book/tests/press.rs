@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use handful::study::statistics::steps_to;
+use handful::study::statistics::{ratio_t_interval, steps_to};
 use handful::study::tables::Tables;
 use handful_book::chapter::{Chapter, Part};
 use handful_book::page::Page;
@@ -329,9 +329,41 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let interval = format!("t interval from {low:.1} to {high:.1}");
     assert!(mean("pets-learned") < mean("sac") && mean("sac") < mean("tdmpc2").min(mean("dreamer")));
     let successes = test_successes("reach", "reach", "pets-learned").iter().sum::<usize>();
+    assert_eq!(successes, 500);
+    // The curves, as their figure's alternative text tells them, and how many runs fall below 80 % again.
+    let range = |method: &str| {
+        let steps = steps_to_80("reach", method);
+        let [first, last] = [steps.iter().copied().fold(f64::MAX, f64::min), steps.iter().copied().fold(0.0, f64::max)];
+        format!("by {} to {}", thousands(first), thousands(last))
+    };
+    let [pets, learned, sac, tdmpc2, dreamer] = ["pets", "pets-learned", "sac", "tdmpc2", "dreamer"].map(range);
+    let curves = format!(
+        "PETS is at 80 % {pets}; PETS with a learned reward {learned}; SAC {sac}; TD-MPC2 {tdmpc2}; Dreamer {dreamer}]"
+    );
+    quotes.extend(["README.md", "chapters/00-start.md"].map(|file| (file, curves.clone())));
+    let tables = Tables::read(&root().join("data/study/reach")).expect("tables");
+    let falling = ["pets", "pets-learned", "sac", "tdmpc2", "dreamer"].map(|method| {
+        let curves = tables.curves("reach", method).expect("curves");
+        let falls = |(steps, success): &&(Vec<f64>, Vec<f64>)| {
+            let by = steps_to(0.8, steps, success).expect("no seed is censored");
+            steps.iter().zip(success).any(|(step, rate)| *step > by && *rate < 0.8)
+        };
+        curves.iter().filter(falls).count()
+    });
+    assert_eq!(falling, [0, 0, 0, 1, 3]);
+    quotes.push(("chapters/12-study.md", "Four of the 25 runs (three of Dreamer, one of TD-MPC2)".into()));
+    // If all of SAC's times were 100 steps late.
+    let earlier: Vec<f64> = steps_to_80("reach", "sac").iter().map(|step| step - 100.0).collect();
+    let [known, learned] = ["pets", "pets-learned"].map(|method| {
+        let steps = steps_to_80("reach", method);
+        let [low, high] = ratio_t_interval(&earlier, &steps).expect("five seeds");
+        let ratio = earlier.iter().sum::<f64>() / steps.iter().sum::<f64>();
+        format!("{ratio:.1} [{low:.1}, {high:.1}]")
+    });
+    quotes.push(("README.md", format!("would be {known} with the known reward and {learned} with a learned one")));
     quotes.extend([
         ("chapters/00-start.md", format!("on this easy task ({:.0})", mean("pets-learned"))),
-        ("chapters/06-pets.md", format!("this agent succeeds in {successes} of 500 test episodes")),
+        ("chapters/06-pets.md", format!("this agent succeeds in all {successes} test episodes")),
         ("chapters/12-study.md", format!("it now needs fewer, too ({interval})")),
     ]);
     let steps: Vec<String> = steps_to_80("reach", "pets").into_iter().map(thousands).collect();
@@ -367,7 +399,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     quotes.extend([
         ("README.md", format!("needs fewer steps on `reach` ({reach_pets}) and `push` ({push_pets})")),
         ("README.md", format!("on `lift`, where that function is the task's reward, it is not shown to ({lift_pets})")),
-        ("README.md", format!("fewer steps than SAC on `reach` ({reach_learned}), and Dreamer on `lift` ({lift_dreamer})")),
+        (
+            "README.md",
+            format!("fewer steps than SAC on `reach` ({reach_learned}), and Dreamer on `lift` ({lift_dreamer})"),
+        ),
     ]);
     // No other method is shown to differ from SAC.
     let others = [

@@ -42,6 +42,9 @@ impl Axis {
             let labels =
                 decades().flat_map(|power| multiples.iter().map(move |times| f64::from(*times) * 10_f64.powi(power)));
             let labels: Vec<f64> = labels.filter(inside).collect();
+            if labels.len() < 2 {
+                return even_labels(low, high);
+            }
             if labels.len() <= LABELS {
                 return labels;
             }
@@ -65,6 +68,17 @@ impl Axis {
         let middle = if self.log { (self.low * self.high).sqrt() } else { (self.low + self.high) / 2.0 };
         (number > middle) == (self.low < self.high)
     }
+}
+
+/// As many multiples of one, two or five times a power of ten as there is room for.
+fn even_labels(low: f64, high: f64) -> Vec<f64> {
+    let power = 10_f64.powf((high - low).log10().floor());
+    let multiples = |step: f64| -> Vec<f64> {
+        let steps = (low / step).ceil() as i64..=(high / step).floor() as i64;
+        steps.map(|count| count as f64 * step).collect()
+    };
+    let several = [power / 5.0, power / 2.0, power, 2.0 * power].map(multiples);
+    several.into_iter().find(|labels| labels.len() <= LABELS).unwrap_or_default()
 }
 
 fn is_wide(low: f64, high: f64) -> bool {
@@ -115,6 +129,11 @@ mod tests {
         assert_eq!(labels(1.0, 200.0), [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0]);
         assert_eq!(labels(0.5, 2e4), [1.0, 10.0, 100.0, 1e3, 1e4]);
         assert!((5..=8).contains(&labels(1.0 / LARGEST, LARGEST).len()));
+        assert_eq!(labels(21.0, 29.0), [22.0, 24.0, 26.0, 28.0]);
+        for (low, high) in [(3.1, 3.9), (0.45, 0.58), (110.0, 190.0), (6e-7, 6.1e-7), (9e9, 9.000_01e9)] {
+            let labels = labels(low, high);
+            assert!((3..=8).contains(&labels.len()), "{labels:?}");
+        }
     }
 
     #[test]

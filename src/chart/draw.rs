@@ -77,9 +77,9 @@ impl Chart {
             .y_desc(&self.y_label)
             .x_labels(self.x_ticks.count)
             .y_labels(self.y_ticks.count)
-            .x_label_formatter(&|x| (self.x_ticks.text)(*x))
+            .x_label_formatter(&|x| self.x_ticks.label(axes[0], *x))
             .y_label_formatter(&|y| {
-                self.rows.get(y.round() as usize).cloned().unwrap_or_else(|| (self.y_ticks.text)(*y))
+                self.rows.get(y.round() as usize).cloned().unwrap_or_else(|| self.y_ticks.label(axes[1], *y))
             })
             .label_style((FONT, 14))
             .draw()?;
@@ -158,6 +158,12 @@ impl Chart {
         let best = corners.into_iter().min_by_key(|(_, right, up)| inside(*right, *up));
         best.expect("four corners").0
     }
+}
+
+/// A number as a power of ten, with up to three digits.
+pub fn scientific(x: f64) -> String {
+    let rounded: f64 = format!("{x:.2e}").parse().expect("a number that was just written");
+    format!("{rounded:e}")
 }
 
 /// A number with up to four decimals, without trailing zeros; a very large one in powers of ten.

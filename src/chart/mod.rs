@@ -88,6 +88,13 @@ impl Default for Ticks {
     }
 }
 
+impl Ticks {
+    /// A number at an axis: as asked for, except that a logarithmic axis shows tiny ones, too.
+    fn label(&self, axis: Axis, number: f64) -> String {
+        if axis.log && number < 1e-4 { draw::scientific(number) } else { (self.text)(number) }
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Shape {
     Line,
@@ -322,5 +329,11 @@ mod tests {
     #[test]
     fn numbers_at_axes_are_short() {
         assert_eq!([0.0, -0.0, 0.25, 1000.0].map(draw::plain), ["0", "0", "0.25", "1000"]);
+        assert_eq!([2e-5, 6.02e-7].map(draw::scientific), ["2e-5", "6.02e-7"]);
+        let tiny =
+            Chart::new("x", "y").line("", [(0.0, 1.5e-5), (1.0, 3e-4)]).log_y().svg().expect("two points to draw");
+        for label in ["2e-5", "5e-5", "0.0001", "0.0002"] {
+            assert!(tiny.contains(&format!("\n{label}\n")), "{label}: {tiny}");
+        }
     }
 }

@@ -61,9 +61,9 @@ fn means(band: &Band) -> impl Iterator<Item = (f64, f64)> {
     band.iter().map(|(x, [_, mean, _])| (*x, *mean))
 }
 
-/// 12500 as "12.5k".
+/// 12500 as "12.5k", 1.25 as "1.25".
 fn thousands(x: f64) -> String {
-    if x >= 1000.0 { format!("{}k", (x / 100.0).round() / 10.0) } else { format!("{x:.0}") }
+    if x >= 1000.0 { format!("{}k", (x / 100.0).round() / 10.0) } else { format!("{}", (100.0 * x).round() / 100.0) }
 }
 
 /// 0.25 as "25 %".

@@ -37,7 +37,6 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
     let error = over_training("open-loop prediction error (1: predicting no change)", &errors)
         .log_y()
         .between(0.8 * least, 1.25 * worst)
-        .y_ticks(6, short)
         .mark(1.0);
     let title = format!("{task}: open-loop predictions of {method} on held-out episodes");
     let mut panels = Panels::new(&title).panel(error);
@@ -91,9 +90,4 @@ fn over_training(title: &str, lines: &[(RGBColor, String, Band)]) -> Chart {
 
 fn whole(y: f64) -> String {
     format!("{y:.0}")
-}
-
-/// Without trailing zeros: "0.05", "2".
-fn short(y: f64) -> String {
-    format!("{}", (100.0 * y).round() / 100.0)
 }
