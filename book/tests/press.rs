@@ -129,6 +129,12 @@ fn steps_to_80(task: &str, method: &str) -> Vec<f64> {
     curves.iter().map(|(steps, success)| steps_to(0.8, steps, success).expect("no seed is censored")).collect()
 }
 
+/// What the five seeds of a method have, as a text lists it.
+fn listed(of_seeds: &[impl ToString]) -> String {
+    let texts: Vec<String> = of_seeds.iter().map(ToString::to_string).collect();
+    format!("{} and {}", texts[..4].join(", "), texts[4])
+}
+
 /// The rows of a table of a study that are about a method on a task.
 fn rows(study: &str, name: &str, task: &str, method: &str) -> Vec<Vec<String>> {
     table(study, name).into_iter().filter(|row| row[..2] == [task, method]).collect()
@@ -234,7 +240,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let [rate, sparc] = ["success", "smoothness_sparc"].map(|column| lift("pets", column));
     quotes.extend(
         [
-            format!("are at 80 % by step {} and {}", steps[..4].join(", "), steps[4]),
+            format!("are at 80 % by step {}", listed(&steps)),
             format!("{:.0} % on average", 100.0 * rate),
             format!("(SPARC {sparc:.1} instead of -4.8)"),
         ]
@@ -246,8 +252,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("pets", ["README.md", "chapters/06-pets.md", "chapters/14-case-study.md"].as_slice()),
         ("pets-learned", &["README.md", "chapters/06-pets.md"]),
     ] {
-        let of_seeds = test_successes("lift", "lift", method).iter().map(usize::to_string).collect::<Vec<_>>();
-        let of_seeds = format!("{} and {} of 100", of_seeds[..4].join(", "), of_seeds[4]);
+        let of_seeds = format!("{} of 100", listed(&test_successes("lift", "lift", method)));
         quotes.extend(files.iter().map(|file| (*file, of_seeds.clone())));
     }
     assert_eq!(test_successes("lift", "lift", "pets-learned"), [84, 88, 89, 88, 90]);
@@ -367,9 +372,8 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("chapters/12-study.md", format!("it now needs fewer, too ({interval})")),
     ]);
     let steps: Vec<String> = steps_to_80("reach", "pets").into_iter().map(thousands).collect();
-    let of_seeds = test_successes("reach", "reach", "pets").iter().map(usize::to_string).collect::<Vec<_>>();
-    assert_eq!(test_successes("reach", "reach", "pets"), [100, 100, 100, 99, 100]);
-    let listed = |numbers: &[String]| format!("{} and {}", numbers[..4].join(", "), numbers[4]);
+    let of_seeds = test_successes("reach", "reach", "pets");
+    assert_eq!(of_seeds, [100, 100, 100, 99, 100]);
     let pets = format!("by step {}, and succeed in {} of 100 test episodes", listed(&steps), listed(&of_seeds));
     quotes.push(("chapters/06-pets.md", pets));
     let sac = 500.0 * first("sac", "success");
