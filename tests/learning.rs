@@ -1,7 +1,7 @@
 //! Agents learn what they should, and a run that was stopped goes on as if it had not been.
 
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use handful::agent::dreamer::ActorCriticConfig;
 use handful::agent::{
@@ -11,8 +11,11 @@ use handful::agent::{
 use handful::checkpoint::Weights;
 use handful::env::{Env, Snapshot, Step, Task, World};
 use handful::error::{Error, Result};
-use handful::model::{EnsembleConfig, ImplicitConfig, RssmConfig, WorldModelConfig};
-use handful::plan::{GuidedConfig, IcemConfig, PlannerConfig};
+use handful::model::uncertainty::Risk;
+use handful::model::{EnsembleConfig, Imagination, ImplicitConfig, Propagation, Reward, RssmConfig, WorldModelConfig};
+use handful::plan::{
+    ActionSequences, ControlConfig, GuidedConfig, IcemConfig, Objective, Plan, PlanObserver, Planner, PlannerConfig,
+};
 use handful::replay::{ReplayBuffer, SequenceReplay, Transition};
 use handful::rng;
 use handful::study::config::RunConfig;
@@ -433,9 +436,9 @@ fn a_resumed_run_with_all_that_sac_can_do_ends_as_if_it_had_never_stopped() {
 fn so_does_one_that_plans() {
     let files = ["episodes.csv", "evaluations.csv", "losses.csv", "model.csv", "test.csv"];
     ends_as_if_it_had_never_stopped(&small_pets(1), &files);
-    // And if the steps of its model are decisions, the last of which the time limit cuts short.
+    // And if the steps of its model are decisions, the last of which the time limit cuts short, and each episode has a member of its own.
     let slow = small_pets(2);
-    let pets = PetsConfig { action_repeat: 7, ..slow.settings().expect("PETS's settings") };
+    let pets = PetsConfig { action_repeat: 7, posterior_sampling: true, ..slow.settings().expect("PETS's settings") };
     ends_as_if_it_had_never_stopped(&slow.with_settings(&pets), &files);
 }
 
@@ -608,6 +611,64 @@ fn costs_in_evaluations_only_leave_training_alone() {
     assert_eq!(free[0], costly[0], "the same episodes in training");
     assert_ne!(free[1], costly[1], "other evaluations");
     assert_ne!(free[0], costly_everywhere[0], "with costs, exploration differs");
+}
+
+/// Returns that a planner was told of resting, in the order of its plans.
+#[derive(Clone, Default)]
+struct Rests(Arc<Mutex<Vec<f32>>>);
+
+impl Planner for Rests {
+    fn reset(&mut self) {}
+
+    fn plan(&mut self, objective: &mut dyn Objective, _: &mut PlanObserver, _: &mut rng::Rng) -> Plan {
+        let mut rest = ActionSequences::new(3, 4);
+        rest.values = vec![0.0; 12];
+        self.0.lock().expect("no panic holds it").extend(objective.returns(&rest));
+        Plan { actions: rest.values, best_return: 0.0 }
+    }
+
+    fn shift(&mut self, _: usize) {}
+}
+
+/// With posterior sampling, each episode of exploration plans in one member, and in the course of time in each of them; evaluations plan in
+/// all of them.
+#[test]
+fn posterior_sampling_explores_with_one_member_at_a_time() {
+    let mut pets: PetsConfig = small_pets(0).settings().expect("PETS's settings");
+    (pets.posterior_sampling, pets.propagation, pets.warm_up) = (true, Propagation::TsInfMean, 30);
+    pets.control = ControlConfig::default();
+    let (mut env, told) = (Task::Reach.make(), Rests::default());
+    let planner = told.clone();
+    let agent = Pets::new(env.spec(), Some(Arc::new(Task::Reach.make())), pets, 0).expect("usable settings");
+    let mut agent = agent.with_planner(move |_| planner.clone());
+    episode(&mut env, &mut agent, 0);
+
+    let obs = env.reset(1);
+    let dynamics = agent.dynamics().expect("fitted").clone();
+    let world = Task::Reach.make();
+    let (reward, propagation) = (Reward::Known(&world), Propagation::TsInfMean);
+    let imagination = Imagination { dynamics: &dynamics, reward, propagation, particles: 5, value: None };
+    let members = imagination.imagined_returns(&obs, &[0.0; 12], 3, &mut rng::stream(0, "unused")).returns;
+    let mut returns_of = |mode: Mode| {
+        told.0.lock().expect("no panic holds it").clear();
+        agent.begin_episode();
+        (0..4).for_each(|_| drop(agent.act(&obs, mode)));
+        told.0.lock().expect("no panic holds it").clone()
+    };
+    let mut seen: Vec<f32> = (0..60)
+        .map(|_| {
+            let returns = returns_of(Mode::Explore);
+            assert!(returns.len() > 1 && returns.iter().all(|told| *told == returns[0]), "one member: {returns:?}");
+            returns[0]
+        })
+        .collect();
+    seen.sort_by(f32::total_cmp);
+    seen.dedup();
+    let mut sorted = members.clone();
+    sorted.sort_by(f32::total_cmp);
+    assert_eq!(seen, sorted, "each member in its turn");
+    let together = Risk::Neutral.of(&members);
+    assert!(returns_of(Mode::Evaluate).iter().all(|told| (told - together).abs() < 1e-6));
 }
 
 /// A folder that an earlier version began is resumed: its keys had other names.

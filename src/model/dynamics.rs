@@ -77,6 +77,24 @@ impl Dynamics {
         self.members.len()
     }
 
+    /// One member alone: an ensemble of one, with that member's learned reward, if there is one.
+    ///
+    /// # Panics
+    /// If there is no such member.
+    #[must_use]
+    pub fn member(&self, member: usize) -> Self {
+        Self {
+            members: vec![self.members[member].clone()],
+            features: self.features.clone(),
+            actions: self.actions,
+            inputs: self.inputs.clone(),
+            targets: self.targets.clone(),
+            floors: vec![self.floors[member].clone()],
+            temperature: self.temperature.clone(),
+            reward: self.reward.as_ref().map(|reward| reward.member(member)),
+        }
+    }
+
     /// Features in an observation.
     pub fn observation_size(&self) -> usize {
         self.features.width

@@ -38,6 +38,7 @@ impl Checkpoint for Pets {
         self.controller = self.controllers.explorer(planner);
         self.decision.reset();
         self.random.reset();
+        self.sampled = None;
         Ok(())
     }
 }

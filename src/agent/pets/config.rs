@@ -27,6 +27,16 @@ pub struct PetsConfig {
     /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.
     /// Without, an agent moves smoothly in evaluations, and still tries what costs more.
     pub explore_with_costs: bool,
+    /// Whether each episode of exploration plans in one member of the ensemble, drawn at its first decision, as if that member were right.
+    /// So an episode tries, over its whole length, what one model of the world thinks best, which explores more than plans in all
+    /// members; evaluations plan in all of them.
+    ///
+    /// Posterior sampling for reinforcement learning (Strens 2000; Osband, Russo & Van Roy 2013), with an ensemble in the place of the
+    /// posterior as in bootstrapped DQN (Osband et al. 2016). Not in PETS. Members disagree because of their initial weights and
+    /// minibatches, and if [`EnsembleConfig::bootstrap`] is set, because of their data.
+    #[doc(alias = "Thompson sampling")]
+    #[doc(alias = "PSRL")]
+    pub posterior_sampling: bool,
     /// Weight of the terminal reward: this many times the reward of resting in a plan's last state is added to the plan's
     /// return, so that a short plan prefers to end well. The gradient steps of `gradient` and `hybrid` planners ascend the rewards alone.
     pub terminal_weight: f32,
@@ -63,6 +73,7 @@ impl Default for PetsConfig {
             control: ControlConfig::default(),
             action_repeat: 1,
             explore_with_costs: true,
+            posterior_sampling: false,
             terminal_weight: 0.0,
             propagation: Propagation::TsInf,
             particles: 5,
@@ -83,6 +94,7 @@ ranges!(PetsConfig {
     control: Nested,
     action_repeat: 1..=1000,
     explore_with_costs: Any,
+    posterior_sampling: Any,
     terminal_weight: 0.0..=1e6,
     propagation: Any,
     particles: 1..=10_000,

@@ -17,8 +17,8 @@
 //!
 //! Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
 //! actions at the beginning are coloured noise; those of the [ensemble](crate::model::ensemble). Risk measures other than the
-//! mean, a penalty or a bonus for disagreement, a reward for a plan's last state, a learned reward, and a model of decisions
-//! that hold an action for several time steps are optional.
+//! mean, a penalty or a bonus for disagreement, exploration by posterior sampling, a reward for a plan's last state, a learned
+//! reward, and a model of decisions that hold an action for several time steps are optional.
 
 mod checkpoint;
 mod config;
@@ -28,6 +28,7 @@ mod objective;
 
 use std::sync::Arc;
 
+use rand::RngExt;
 use rayon::prelude::*;
 
 pub use config::PetsConfig;
@@ -99,6 +100,8 @@ pub struct Pets {
     controllers: MakeController,
     /// Plans in the environment that it learns from.
     controller: Controller,
+    /// With posterior sampling, the member that this episode of exploration plans in, once it is drawn.
+    sampled: Option<usize>,
     /// Plan in the environments that it is evaluated in.
     slots: Slots<Controller>,
     rng: Rng,
@@ -138,6 +141,7 @@ impl Pets {
             random: RandomActions::new(config.warm_up_noise_beta, decisions, spec.action_size),
             controller: controllers.explorer(rng::stream(seed, "pets planner")),
             controllers,
+            sampled: None,
             slots: Slots::default(),
             spec: spec.clone(),
             reward,
@@ -187,16 +191,21 @@ impl Agent for Pets {
         self.controller.reset();
         self.decision.reset();
         self.random.reset();
+        self.sampled = None;
         self.slots.clear(0);
     }
 
     fn act(&mut self, obs: &[f32], mode: Mode) -> Vec<f32> {
-        let Self { config, spec, reward, dynamics, random, controllers, controller, slots, rng, .. } = self;
+        let Self { config, spec, reward, dynamics, random, controllers, controller, sampled, slots, rng, .. } = self;
         match (dynamics, mode) {
             (None, Mode::Explore) => controller.held.next(config.action_repeat, || random.next(rng)),
             (None, Mode::Evaluate) => vec![0.0; spec.action_size],
             (Some(dynamics), Mode::Explore) => {
-                let model = PlanningModel::new(config, dynamics, reward.as_deref());
+                let member = config.posterior_sampling.then(|| {
+                    let drawn = *sampled.get_or_insert_with(|| rng.random_range(0..dynamics.members()));
+                    dynamics.member(drawn)
+                });
+                let model = PlanningModel::new(config, member.as_ref().unwrap_or(dynamics), reward.as_deref());
                 controller.act(&model, obs, config.disagreement_bonus, &mut |_| {})
             }
             (Some(dynamics), Mode::Evaluate) => {
@@ -241,6 +250,7 @@ impl Agent for Pets {
         if transition.terminated || transition.truncated {
             self.controller.reset();
             self.random.reset();
+            self.sampled = None;
         }
     }
 

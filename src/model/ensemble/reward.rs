@@ -188,6 +188,20 @@ impl LearnedReward {
         self.members.len()
     }
 
+    /// One member alone.
+    ///
+    /// # Panics
+    /// If there is no such member.
+    #[must_use]
+    pub fn member(&self, member: usize) -> Self {
+        Self {
+            members: vec![self.members[member].clone()],
+            inputs: self.inputs.clone(),
+            normaliser: self.normaliser.clone(),
+            ..*self
+        }
+    }
+
     /// The rewards of transitions as one member predicts them: `obs` and `next_obs` hold `rewards.len()` rows, one after the
     /// other, as does `actions`.
     ///
