@@ -3,8 +3,8 @@
 use nalgebra::Vector3;
 
 use super::helpers::{
-    GRIPPER, action_to_grasp, action_towards, cube_features, difference_features, grasped, gripper_features,
-    gripper_values, log_reaching_reward, object_values, pose_on_table, reaching_reward, robosuite_object_state,
+    GRIPPER, action_to_grasp, action_towards, difference_features, grasped, gripper_features, gripper_values,
+    log_reaching_reward, object_features, object_values, pose_on_table, reaching_reward, robosuite_object_state,
     vector_at,
 };
 use super::task::{Setup, TableTask, TaskOutcome, TaskView};
@@ -48,9 +48,8 @@ impl TableTask for Lift {
         Setup { objects: vec![physics.add_box(half, 1000.0, 1.0, &pose)], goal: None }
     }
 
-    /// Of a cube, although its three sizes are drawn separately (40 to 44 mm): no feature shows them.
     fn features(&self) -> Vec<Feature> {
-        gripper_features().into_iter().chain(cube_features("cube")).chain(difference_features("hand", "cube")).collect()
+        [gripper_features(), object_features("cube"), difference_features("hand", "cube").collect()].concat()
     }
 
     fn observe(&self, view: &TaskView) -> Vec<f64> {
