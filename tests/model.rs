@@ -392,6 +392,23 @@ fn rewards_can_be_learned() {
     }
 }
 
+/// A member alone predicts what it predicts among the others, and so does its reward.
+#[test]
+fn a_member_can_stand_alone() {
+    let dynamics = fitted(EnsembleConfig { learn_reward: true, ..config() }).dynamics();
+    let (obs, action) = (seen(0.1, 0.0), [0.5]);
+    let (means, variances) = dynamics.member_predictions(&obs, &action);
+    for i in 0..dynamics.members() {
+        let alone = dynamics.member(i);
+        assert_eq!(alone.members(), 1);
+        assert_eq!(alone.member_predictions(&obs, &action), (vec![means[i].clone()], vec![variances[i].clone()]));
+        let mut among = [0.0];
+        dynamics.learned_reward().expect("learned").of_member(i, &obs, &action, &obs, &mut among);
+        assert_eq!(alone.learned_reward().expect("learned").reward(&obs, &action, &obs), among[0]);
+    }
+    assert_ne!(means[0], means[1], "members differ");
+}
+
 /// A hand, and a block that it pushes along when it runs into it from the left: how far do models let the block creep where
 /// nobody touches it?
 #[test]

@@ -146,7 +146,7 @@ fn table(study: &str, name: &str) -> Vec<Vec<String>> {
     table.lines().map(|line| line.split(',').map(String::from).collect()).collect()
 }
 
-/// The open-loop error of a method's model in units of that of predicting no change: the median of its seeds at the last step.
+/// The open-loop error of a method's model in standard deviations of the change: the median of its seeds at the last step.
 fn model_error(task: &str, method: &str, steps_ahead: &str) -> f64 {
     let rows = rows(task, "models.csv", task, method);
     let step = |row: &Vec<String>| row[3].parse::<usize>().expect("a step");
@@ -271,7 +271,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         (
             "README.md",
             format!(
-                "are {:.1} and {:.1} times the error of predicting no change on `reach`, and {:.1} and {:.1} times on `lift`; one step ahead on `lift`, where little changes, Dreamer's is {:.0} times",
+                "are {:.1} and {:.1} standard deviations of the change on `reach`, and {:.1} and {:.1} on `lift`; one step ahead on `lift`, where little changes, Dreamer's is {:.0} (medians",
                 dreamer[0],
                 tdmpc2[0],
                 dreamer[1],
@@ -402,7 +402,7 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let push_pets = ratio("push", "pets");
     quotes.extend([
         ("README.md", format!("needs fewer steps on `reach` ({reach_pets}) and `push` ({push_pets})")),
-        ("README.md", format!("on `lift`, where that function is the task's reward, it is not shown to ({lift_pets})")),
+        ("README.md", format!("On `lift`, no difference is shown ({lift_pets})")),
         (
             "README.md",
             format!("fewer steps than SAC on `reach` ({reach_learned}), and Dreamer on `lift` ({lift_dreamer})"),
@@ -445,7 +445,8 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         (
             "chapters/10-dreamer.md",
             format!(
-                "All five seeds of Dreamer reach a success rate of 80 % within 3,000 steps, the median seed by step {}",
+                "All five seeds of Dreamer reach a success rate of 80 % by step {}, the median seed by step {}",
+                thousands(steps_to_80("reach", "dreamer").into_iter().fold(0.0, f64::max)),
                 median("dreamer")
             ),
         ),

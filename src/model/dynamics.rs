@@ -77,7 +77,7 @@ impl Dynamics {
         self.members.len()
     }
 
-    /// One member alone: an ensemble of one, with that member's learned reward, if there is one.
+    /// One member alone: an ensemble of one, with the learned reward's member of the same index, if there is one.
     ///
     /// # Panics
     /// If there is no such member.

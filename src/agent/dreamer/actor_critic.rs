@@ -211,9 +211,9 @@ impl ActorCritic {
 
     /// The actor's loss in one state: the objective of eq. 11, by REINFORCE with the critic as baseline (as in arXiv v2):
     ///
-    /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)] - c |mu_t|^2)`
+    /// `-w_t (sg((R_t - v_t) / S) log pi(a_t | s_t) + eta H[pi(. | s_t)] - kappa |mu_t|^2)`
     ///
-    /// with the weight `w_t`, the entropy coefficient eta, and, unlike there, a penalty on the mean (`mean_penalty` c). Also the
+    /// with the weight `w_t`, the entropy coefficient eta, and, unlike there, a penalty on the mean (`mean_penalty` kappa). Also the
     /// entropy; the gradient with respect to the policy's head goes into `slope`.
     #[doc(alias = "policy gradient")]
     #[doc(alias = "entropy bonus")]

@@ -12,9 +12,9 @@ use crate::rng::{self, Rng};
 impl ActorCritic {
     /// The actor's loss on a rollout that [`ActorCritic::imagine`] drew from `start` with this generator, drawn again on `tape`:
     ///
-    /// `-1/H sum_t w_t (R_t / S + eta H[pi(. | s_t)] - c |mu_t|^2)`
+    /// `-1/H sum_t w_t (R_t / S + eta H[pi(. | s_t)] - kappa |mu_t|^2)`
     ///
-    /// with the return scale S, the entropy coefficient eta and the `mean_penalty` c, as terms for [`ops::total`]. Weights and
+    /// with the return scale S, the entropy coefficient eta and the `mean_penalty` kappa, as terms for [`ops::total`]. Weights and
     /// continuations are under a stop-gradient, and so are the states that the policy reads. Gradients flow into the world model's
     /// parameters, too: only those of the policy are meant to be used.
     pub(super) fn dynamics_loss<T: Tape<f32, Cpu>>(

@@ -27,9 +27,10 @@ pub struct PetsConfig {
     /// Whether plans pay `control.effort_penalty` and `control.change_penalty` in [`Mode::Explore`](crate::agent::Mode), too.
     /// Without, an agent moves smoothly in evaluations, and still tries what costs more.
     pub explore_with_costs: bool,
-    /// Whether each episode of exploration plans in one member of the ensemble, drawn at its first decision, as if that member were right.
-    /// So an episode tries, over its whole length, what one model of the world thinks best, which explores more than plans in all
-    /// members; evaluations plan in all of them.
+    /// Whether exploration plans in one member of the ensemble, as if that member were right. It is drawn at an episode's first decision,
+    /// and again after a fit. So an episode tries what one possible model of the world thinks best; evaluations plan in all members. Alone,
+    /// a member disagrees with nobody: in exploration, `disagreement_penalty` and `disagreement_bonus` have no effect, nor has `risk` if
+    /// particles have no noise.
     ///
     /// Posterior sampling for reinforcement learning (Strens 2000; Osband, Russo & Van Roy 2013), with an ensemble in the place of the
     /// posterior as in bootstrapped DQN (Osband et al. 2016). Not in PETS. Members disagree because of their initial weights and

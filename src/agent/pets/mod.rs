@@ -100,7 +100,7 @@ pub struct Pets {
     controllers: MakeController,
     /// Plans in the environment that it learns from.
     controller: Controller,
-    /// With posterior sampling, the member that this episode of exploration plans in, once it is drawn.
+    /// With posterior sampling, the member that exploration plans in, until the episode ends or a fit orders the members anew.
     sampled: Option<usize>,
     /// Plan in the environments that it is evaluated in.
     slots: Slots<Controller>,
@@ -173,6 +173,7 @@ impl Pets {
         // Inside the thread pool: a parallel section entered from outside hands its work over each time.
         let fit = rayon::scope(|_| self.ensemble.fit(&self.replay, &mut self.rng));
         self.dynamics = Some(self.ensemble.dynamics());
+        self.sampled = None;
         let mut losses = Losses::from([("model_loss", fit.loss), ("model_steps", fit.steps as f32)]);
         if !fit.errors.is_empty() {
             let mean = fit.errors.iter().sum::<f64>() / fit.errors.len() as f64;
