@@ -14,6 +14,7 @@ impl Checkpoint for Pets {
     fn load_weights(&mut self, weights: &Weights) -> Result<()> {
         self.ensemble.load_weights(weights)?;
         self.dynamics = self.ensemble.is_fitted().then(|| self.ensemble.dynamics());
+        self.sampled = None;
         Ok(())
     }
 

@@ -101,7 +101,7 @@ pub struct Pets {
     /// Plans in the environment that it learns from.
     controller: Controller,
     /// With posterior sampling, the member that exploration plans in, until the episode ends or a fit orders the members anew.
-    sampled: Option<usize>,
+    sampled: Option<Dynamics>,
     /// Plan in the environments that it is evaluated in.
     slots: Slots<Controller>,
     rng: Rng,
@@ -202,11 +202,12 @@ impl Agent for Pets {
             (None, Mode::Explore) => controller.held.next(config.action_repeat, || random.next(rng)),
             (None, Mode::Evaluate) => vec![0.0; spec.action_size],
             (Some(dynamics), Mode::Explore) => {
-                let member = config.posterior_sampling.then(|| {
-                    let drawn = *sampled.get_or_insert_with(|| rng.random_range(0..dynamics.members()));
-                    dynamics.member(drawn)
-                });
-                let model = PlanningModel::new(config, member.as_ref().unwrap_or(dynamics), reward.as_deref());
+                let trusted = if config.posterior_sampling {
+                    sampled.get_or_insert_with(|| dynamics.member(rng.random_range(0..dynamics.members())))
+                } else {
+                    dynamics
+                };
+                let model = PlanningModel::new(config, trusted, reward.as_deref());
                 controller.act(&model, obs, config.disagreement_bonus, &mut |_| {})
             }
             (Some(dynamics), Mode::Evaluate) => {
