@@ -42,7 +42,9 @@ fn check_gradients(
                 inputs[which].copy_from(&numbers);
                 f64::from(loss(&inputs, false).0)
             };
-            let difference = (moved(H) - moved(-H)) / f64::from(2.0 * H);
+            let central = |h: f32| (moved(h) - moved(-h)) / f64::from(2.0 * h);
+            // Richardson's extrapolation: where a loss bends sharply, the error of a single difference exceeds the bound.
+            let difference = (4.0 * central(H / 2.0) - central(H)) / 3.0;
             let scale = exact.iter().fold(0.0_f32, |a, g| a.max(g.abs()));
             let error = (f64::from(exact[at]) - difference).abs() / f64::from(scale.max(1e-3));
             assert!(error < 2e-2, "input {which}, number {at}: {} by the tape, {difference} by differences", exact[at]);
