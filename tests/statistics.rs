@@ -290,14 +290,16 @@ fn a_verdict_needs_four_seeds() {
     let folder = study_by_hand(&[fast, slow]);
     let report = report_in(folder.path());
     assert!(report.contains("Significantly fewer steps to 80 % than `sac`: `pets`."), "{report}");
-    assert!(report.contains("+0 percentage points, without an interval"), "{report}");
+    assert!(report.contains("+0.0 percentage points, without an interval"), "{report}");
     // Nobody else was compared.
     assert!(
-        report.contains("`pets` is told the reward function; of the methods that are not, `sac` is first"),
+        report.contains(
+            "`pets` is given a reward function; of the methods that are not, `sac` is earliest, by step 1500."
+        ),
         "{report}"
     );
     let alone = study_by_hand(&[fast]);
-    assert!(report_in(alone.path()).contains("`pets` is told the reward function.\n"));
+    assert!(report_in(alone.path()).contains("`pets` is given a reward function.\n"));
     // Who succeeds without training takes no steps: there is no ratio.
     let at_once: ByHand = ("pets", &[20; 4], 0, [500, 2000]);
     let report = report_in(study_by_hand(&[at_once, slow]).path());
@@ -324,7 +326,10 @@ fn a_report_says_where_methods_do_not_have_the_same_environment() {
     let alike = report_with(shaped, shaped);
     assert!(!alike.contains("another reward") && !alike.contains("Not the same environment"), "{alike}");
     let knows = report_with(&format!("{shaped}\nplanning_reward = \"\"log\"\""), shaped);
-    assert!(knows.contains("On `pole`, `pets` knows another reward (`log`) than the one that is measured"), "{knows}");
+    assert!(
+        knows.contains("On `pole`, `pets` plans with a different reward (`log`) from the one that is measured"),
+        "{knows}"
+    );
     assert!(!knows.contains("Not the same environment"), "{knows}");
     let differ = report_with(shaped, "reward = \"\"sparse\"\"");
     let expected = "that of `sac` on `pole` is not that of `pets` (its `reward` is \"sparse\", not \"shaped\")";
@@ -416,19 +421,20 @@ fn a_summary_says_what_its_seeds_can_tell() {
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
         "| 1000 (12 s) | 2.5 |",
-        "- **pole**\n  - `pets` is first to reach 80 % success, by step 500 (median). `pets` is told the reward function; of the \
-         methods that are not, `dreamer` is first, by step 1000.\n  - Not every seed reaches 80 % within its budget, so there is no ratio of \
+        "- **pole**\n  - `pets` is earliest at 80 % success, by step 500 (median). `pets` is given a reward function; of the \
+         methods that are not, `dreamer` is earliest, by step 1000.\n  - Not every seed reaches 80 % within its budget, so there is no ratio of \
          steps to `sac`: `dreamer`. Fewer than 4 seeds of one of the two, too few to compare steps to 80 % with `sac`: `pets`.\n  - Fewer than 4 seeds of one of the two, \
-         too few to compare test success with `sac`: `dreamer`, `pets`.\n",
+         too few to compare test success (after different budgets) with `sac`: `dreamer`, `pets`.\n",
         "one seed: the interval covers its test episodes, not what another seed would bring",
-        "minus that of `sac`: +50 percentage points [",
-        "takes at least 4.0 times as many steps",
+        "minus that of `sac`: +50.0 percentage points [",
+        "takes at least 4.00 times as many steps on average",
         "**Not evaluated alike:** `dreamer` every 500 steps with 20 episodes",
         "`sac` every 1000 steps",
         "| 0.80 [0.40, 1.00] | 0.90 [0.70, 1.00] |",
         "- **no**: each learning method of a task has at least five seeds. Exceptions: `pets` on `pole` has 2; `sac` on `pole` has 1.",
         "- **no**: all learning methods of a task have the same seeds. Exceptions: `pets` on `pole` lacks 2, 3, 4; `sac` on `pole` lacks 1, 2, 3, 4.",
         "Exceptions: the version is not recorded.",
+        "- **no**: all learning methods of a task are trained for the same number of steps. Exceptions: on `pole`, 1000 for `pets` and 2000 for `dreamer` and `sac`.",
     ] {
         assert!(report.contains(part), "no `{part}` in: {report}");
     }

@@ -5,6 +5,7 @@ use std::fmt::Write;
 
 use super::starts::Starts;
 use super::tables::{Run, Tables};
+use super::verdict::{budgets, listed};
 use super::version::is_one_commit;
 use crate::error::{Result, shortened};
 use crate::watch::escaped;
@@ -49,24 +50,43 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     }
     item("each learning method of a task has at least five seeds", &few);
     item("all learning methods of a task have the same seeds", &missing);
-    item("every run is included", &left_out(tables)?);
+    item("every run that was found is included", &left_out(tables)?);
     item(
-        "all learning methods of a task are evaluated at the same steps with the same number of episodes",
+        "all learning methods of a task are trained for the same number of steps",
+        &different_budgets(tables, &of_tasks)?,
+    );
+    item(
+        "all learning methods of a task are evaluated at the same steps, as far as they are all trained, with the same number of episodes",
         &different_grids.iter().map(|task| format!("on `{task}`")).collect::<Vec<_>>(),
     );
     item("each agent is tested in at least 100 episodes", &short);
     let tuning = tables.starts()? == Starts::Development;
     let tuned = if tuning { vec!["these are development starts".into()] } else { Vec::new() };
-    item("the test has starts of its own, which serve neither development nor training nor the curves", &tuned);
+    item("training, the curves, development runs and the test have starts of their own", &tuned);
     item("one version of the library, with its sources committed, made all runs", &versions(&tables.runs()?));
     Ok(text
-        + "\nRuns that do not reach the level count as right-censored. What the tables cannot tell: on which starts and seeds the settings were \
-           chosen, and with how many trials for each method.\n")
+        + "\nRuns that do not reach the level count as right-censored. What the tables cannot tell: whether settings were chosen after results \
+           on the test's starts had been seen, on which seeds, and with how many trials for each method; and which runs were given up or \
+           replaced.\n")
 }
 
 /// A text that may be anything, as code.
 fn quoted(text: &str) -> String {
     format!("`{}`", text.replace(['`', '\n', '\r'], " "))
+}
+
+/// The budgets of each task whose methods do not all have the same.
+fn different_budgets(tables: &Tables, tasks: &BTreeMap<String, BTreeSet<u64>>) -> Result<Vec<String>> {
+    let mut exceptions = Vec::new();
+    for task in tasks.keys() {
+        let budgets = budgets(tables, task)?;
+        if budgets.len() > 1 {
+            let each: Vec<String> =
+                budgets.iter().map(|(steps, methods)| format!("{steps} for {}", listed(methods))).collect();
+            exceptions.push(format!("on `{task}`, {}", listed(&each)));
+        }
+    }
+    Ok(exceptions)
 }
 
 /// The runs that are in no table, and why.

@@ -1,5 +1,7 @@
 //! What a study shows, in a few sentences at the head of its report.
 
+use std::collections::BTreeMap;
+
 use super::tables::{BASELINE, LEVEL, Tables};
 use crate::error::Result;
 
@@ -11,6 +13,10 @@ pub(super) fn verdict(tables: &Tables, tasks: &[&str]) -> Result<String> {
     let mut text = String::new();
     for task in tasks {
         text += &on_task(tables, task)?;
+    }
+    if text.contains("ignificant") {
+        text += "\nA difference is called significant if neither the 95 % bootstrap interval nor the 95 % t interval includes equality. The \
+                 intervals are not corrected for the number of comparisons.\n";
     }
     Ok(text)
 }
@@ -35,7 +41,7 @@ fn on_task(tables: &Tables, task: &str) -> Result<String> {
     Ok(format!("- **{task}**\n{}", points.concat()))
 }
 
-/// Which methods reach the level first, and which of those that are not told the reward.
+/// Which methods have the smallest median of steps to the level, and which of those that are not given a reward function.
 fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<String> {
     let mut medians: Vec<(f64, &str)> = Vec::new();
     for method in learning {
@@ -53,19 +59,19 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
             None => {}
         }
     }
-    let mut text = format!("{} first to reach {level:.0} % success, by step {steps:.0} (median).", are(&first));
+    let mut text = format!("{} earliest at {level:.0} % success, by step {steps:.0} (median).", are(&first));
     let told: Vec<&str> = first.iter().copied().filter(|method| informed.contains(method)).collect();
     if told.is_empty() {
         return Ok(text);
     }
-    text += &format!(" {} told the reward function", are(&told));
+    text += &format!(" {} given a reward function", are(&told));
     medians.retain(|(_, method)| uninformed.contains(method));
     let known = informed.len() + uninformed.len() == learning.len();
     let others = if known { "the methods that are not" } else { "those that are known not to be" };
     text += &match earliest(&medians) {
         _ if told.len() < first.len() || uninformed.is_empty() => ".".into(),
         Some((steps, first)) => {
-            format!("; of {others}, {} first, by step {steps:.0}.", are(&first))
+            format!("; of {others}, {} earliest, by step {steps:.0}.", are(&first))
         }
         None => format!("; of {others}, none reaches {level:.0} % in its median seed."),
     };
@@ -118,10 +124,17 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
         vec![Comparison { column: "return_minus_sac", equal: 0.0, measure, above: "higher", below: "lower" }]
     } else {
         let steps = format!("steps to {level:.0} %");
-        let success = "test success".into();
+        let success =
+            if budgets(tables, task)?.len() > 1 { "test success (after different budgets)" } else { "test success" };
         vec![
             Comparison { column: "sac_steps_ratio", equal: 1.0, measure: steps, above: "fewer", below: "more" },
-            Comparison { column: "success_minus_sac", equal: 0.0, measure: success, above: "more", below: "less" },
+            Comparison {
+                column: "success_minus_sac",
+                equal: 0.0,
+                measure: success.into(),
+                above: "more",
+                below: "less",
+            },
         ]
     };
     for Comparison { column, equal, measure, above, below } in comparisons {
@@ -158,6 +171,20 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
     Ok(points)
 }
 
+/// The budgets, in steps, of the methods that learn a task, and the methods that have each.
+///
+/// # Errors
+/// If the summary lacks a column.
+pub(super) fn budgets(tables: &Tables, task: &str) -> Result<BTreeMap<u64, Vec<String>>> {
+    let mut budgets: BTreeMap<u64, Vec<String>> = BTreeMap::new();
+    for method in tables.methods(task)? {
+        if let Some(steps) = tables.value(task, &method, "steps")? {
+            budgets.entry(steps as u64).or_default().push(format!("`{method}`"));
+        }
+    }
+    Ok(budgets)
+}
+
 /// The methods in the order of their smoothness.
 fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<String>> {
     let mut known: Vec<(f64, &str)> = Vec::new();
@@ -169,7 +196,7 @@ fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<
     }
     known.sort_by(|a, b| b.0.total_cmp(&a.0));
     let known: Vec<String> = known.iter().map(|(sparc, method)| format!("`{method}` {sparc:.1}")).collect();
-    Ok(Some(format!("SPARC, from the smoothest hand to the jerkiest: {}.", known.join(", "))))
+    Ok(Some(format!("Smoothness of the hand's path (SPARC, the smoothest first; not tested): {}.", known.join(", "))))
 }
 
 #[cfg(test)]

@@ -25,7 +25,7 @@ pub fn profile(tables: &Tables, task: &str, path: &Path) -> Result<bool> {
         .between(-0.02, 1.04)
         .y_ticks(6, percent)
         .legend(SeriesLabelPosition::LowerLeft);
-    let mut cost = Chart::new("seconds of training", "")
+    let mut cost = Chart::new("seconds of training, evaluations included", "")
         .titled("success rate of each seed")
         .log_x()
         .between(-0.02, 1.04)

@@ -38,7 +38,7 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
         .log_y()
         .between(0.8 * least, 1.25 * worst)
         .mark(1.0);
-    let title = format!("{task}: open-loop predictions of {method} on held-out episodes");
+    let title = format!("{task}: open-loop predictions of {method} on its evaluation episodes");
     let mut panels = Panels::new(&title).panel(error);
     if !coverages.is_empty() {
         let coverage = over_training("coverage of the 90 % interval", &coverages);

@@ -121,16 +121,17 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
     }
     let [told, unknown] = [told, unknown].map(|methods| methods.into_iter().collect::<Vec<String>>());
     let mut text = String::from(
-        "All methods of a task start from the same initial states. They are evaluated without exploration noise (planners still \
-         sample their candidates), and every environment step counts, also in the random warm-up. Every number on this page comes from \
-         the study's `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv`; settings are listed at the end.\n",
+        "All methods of a task are evaluated, and tested, from the same initial states, without exploration noise (planners still sample \
+         their candidates). The test is of the agent at the end of training; no earlier one is selected. Every environment step of \
+         training counts, also in the random warm-up. Every number on this page comes from the study's `tests.csv`, `evaluations.csv`, \
+         `models.csv`, `values.csv`, `runs.csv` and `summary.csv`; settings are listed at the end.\n",
     );
     if !told.is_empty() {
         text += &format!(
-            "\nThe methods do not have the same information: {} know{} the reward as a function{}{}. The other learning methods have \
-             only the rewards that they receive.\n",
+            "\nThe methods are not given the same information: {} {} given a reward function{}{}. The other learning methods have only \
+             the rewards that they receive.\n",
             listed(&told),
-            if told.len() == 1 { "s" } else { "" },
+            if told.len() == 1 { "is" } else { "are" },
             if told.iter().any(|method| method == "`oracle`") {
                 ", and `oracle` plans in the true simulator"
             } else {
@@ -160,9 +161,10 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
             if n == 1.0 { "" } else { "s" }
         ),
         n => format!(
-            "Each learning method has at least {n:.0} seeds. With five, a bootstrap interval that should cover the truth in 95 % \
-             of cases covers it in 85 to 95 %, the less the more the seeds differ; the t interval over seeds is the safer one. Neither \
-             accounts for a failure so rare that no seed shows it.\n"
+            "Each learning method has at least {n:.0} seeds. With five, a two-level bootstrap that should cover the truth in 95 % of cases \
+             covers it in 85 to 95 %, the less the more the seeds differ, and a bootstrap over seeds alone (of ratios, and of \
+             probabilities of improvement) in about 85 %; the t interval over seeds is the safer one. Neither accounts for a \
+             failure so rare that no seed shows it.\n"
         ),
     })
 }

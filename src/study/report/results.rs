@@ -18,20 +18,27 @@ pub(super) fn section(tables: &Tables) -> Result<String> {
          is the two-level bootstrap: seeds are drawn, then the episodes of each. With one seed (a method that does not learn needs only one), \
          and where all episodes have the same outcome, it is the Wilson interval, which covers the test episodes and not the differences \
          between seeds.\n\
+         - *[a, b]*: a 95 % interval, by the bootstrap where nothing else is said.\n\
          - *steps*: environment steps of training.\n\
          - *{level:.0} % by step*: the first evaluation at which that success rate is reached and confirmed by the next one; the \
          median over seeds (a dash if the median seed does not reach it within its budget). In brackets the median of the seconds until \
          then, evaluations included, on a machine that several runs shared.\n\
-         - *ms per action*: the time that choosing an action takes in the last evaluation, median over seeds. With action repeat, it is \
-         chosen for several steps.\n\
+         - *ms per action*: the time that choosing the first action of an episode takes in the last evaluation, in one environment; the \
+         median of five times, and over seeds. With action repeat, it is chosen for several steps. All times are of machines that may \
+         differ and be shared.\n\
          - *SPARC*, *LDLJ*: spectral arc length and log dimensionless jerk of the hand's path; closer to zero is smoother.\n\
          - *area under the curve*: the mean success rate up to the smallest budget, with a t interval over seeds.\n\
+         - *gradient updates*: steps of the optimiser (of the critics, for `sac`; of the ensemble, for `pets`). Batches differ, so these \
+         numbers do not compare between methods.\n\
          - *action change*: root mean square of the change from one action to the next in the test.\n\
-         - *optimism*: (expected - realised return) / |realised return| in the last evaluation. \
-         Expected is what a value says (discounted), or what a plan predicts for its horizon (undiscounted), so only methods of one kind \
-         compare. *Correlation* is that of the two over time steps.\n\
-         - *better*, *earlier*: the probability that a seed has more test success than one of `{BASELINE}`, or reaches \
-         {level:.0} % by an earlier step (probability of improvement; ties, and pairs whose order censoring hides, count one half).\n\n</details>\n",
+         - *optimism*: (expected - realised return) / |realised return| in the last evaluation. Methods with a value function expect its \
+         value (of `sac`, a soft value, with entropies), and realise the discounted rewards that follow plus, at the time limit, that \
+         value again, which makes optimism look smaller. Planners without one expect what a plan predicts for its horizon, undiscounted, in \
+         the reward that they plan with. Only methods of one kind compare. *Correlation* is that of the two over time steps.\n\
+         - *return minus `{BASELINE}`'s*: the difference of mean test returns, with a t interval over seeds.\n\
+         - *better*, *earlier*: the probability that a seed has more test success than one of `{BASELINE}`, or reaches {level:.0} % by an \
+         earlier step (probability of improvement; 0.5 means no difference; ties, and pairs whose order is unknown because of censoring, \
+         count one half). There is no interval where all pairs agree.\n\n</details>\n",
         markdown(&rows(tables)?)
     ))
 }

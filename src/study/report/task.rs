@@ -54,7 +54,10 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
     let stem = figures::stem(task, method);
     let file = format!("{stem}-model.svg");
     if figures::model(tables, task, method, &to.join(&file))? {
-        text += &format!("![Open-loop prediction error and calibration of the model of {method}]({file})\n\n");
+        text += &format!(
+            "![Open-loop prediction error of the model of {method} on the method's own evaluation episodes, in standard deviations of the \
+             change (root mean square over features; 1 is the error of predicting no change), and the coverage of its 90 % interval]({file})\n\n"
+        );
     }
     let file = format!("{stem}-values.svg");
     if figures::values(tables, task, method, &to.join(&file))? {
@@ -130,7 +133,7 @@ fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
 
 /// The numbers of the methods that learn a task which the first table has no room for.
 fn details(tables: &Tables, task: &str) -> Result<String> {
-    let mut rows = String::new();
+    let (mut rows, mut common) = (String::new(), None);
     for method in tables.methods(task)? {
         let value = |column: &str| tables.value(task, &method, column);
         if value("steps")?.is_none() {
@@ -139,29 +142,33 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
         let show = |column: &str, text: fn(f64) -> String| value(column).map(|found| found.map_or("-".into(), text));
         let with_interval = |column: &str, kind: &str| -> Result<String> {
             Ok(match (value(column)?, interval(tables, task, &method, &format!("{column}{kind}"))?) {
-                (Some(x), (Some(low), Some(high))) => format!("{x:.2} [{low:.2}, {high:.2}]"),
+                // Where all resamples agree, there is no interval.
+                (Some(x), (Some(low), Some(high))) if low < high => format!("{x:.2} [{low:.2}, {high:.2}]"),
                 (Some(x), _) => format!("{x:.2}"),
                 _ => "-".into(),
             })
         };
         rows += &format!(
-            "| {method} | {} | {} | {} | {} | {} | {} | {} |\n",
+            "| {method} | {} | {} | {} | {} | {} | {} | {} | {} |\n",
             with_interval("area_under_curve", "_t")?,
             show("updates", |updates| format!("{updates:.0}"))?,
             show("action_change", |change| format!("{change:.2}"))?,
             show("optimism", |share| format!("{:+.0} %", (100.0 * share).round() + 0.0))?,
             show("return_correlation", |correlation| format!("{correlation:.2}"))?,
+            with_interval("return_minus_sac", "_t")?,
             with_interval("improvement_over_sac", "")?,
             with_interval("earlier_than_sac", "")?,
         );
+        common = value("common_budget")?.or(common);
     }
     if rows.is_empty() {
         return Ok(rows);
     }
     Ok(format!(
-        "\n| method | area under the curve | gradient updates | action change | optimism | correlation | better than `{BASELINE}` | earlier than `{BASELINE}` |\n\
-         |{}\n{rows}",
-        " --- |".repeat(8)
+        "\n| method | area under the curve{} | gradient updates | action change | optimism | correlation | return minus `{BASELINE}`'s | \
+         better than `{BASELINE}` | earlier than `{BASELINE}` |\n|{}\n{rows}",
+        common.map_or(String::new(), |steps| format!(" to step {steps:.0}")),
+        " --- |".repeat(9)
     ))
 }
 
@@ -169,22 +176,23 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
 fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<String> {
     let value = |column: &str| tables.value(task, method, column);
     let measure = ("Success", "success_minus_sac", " percentage points");
-    let mut text = difference(tables, task, method, measure, |share| format!("{:+.0}", (100.0 * share).round() + 0.0))?;
+    let mut text =
+        difference(tables, task, method, measure, |share| format!("{:+.1}", (1000.0 * share).round() / 10.0 + 0.0))?;
     let level = 100.0 * LEVEL;
     match (value("sac_steps_ratio")?, interval(tables, task, method, "sac_steps_ratio")?) {
         (Some(ratio), (Some(low), Some(high))) => {
             text += &format!(
-                " To {level:.0} % success `{BASELINE}` takes {ratio:.1} times as many steps [{low:.1}, {high:.1}]{}.",
+                " To {level:.0} % success `{BASELINE}` takes {ratio:.2} times as many steps on average [{low:.2}, {high:.2}]{}.",
                 match interval(tables, task, method, "sac_steps_ratio_t")? {
-                    (Some(low), Some(high)) => format!(", t interval [{low:.1}, {high:.1}]"),
+                    (Some(low), Some(high)) => format!(", t interval [{low:.2}, {high:.2}]"),
                     _ => String::new(),
                 }
             );
         }
         (Some(ratio), (Some(low), None)) => {
             text += &format!(
-                " To {level:.0} % success `{BASELINE}` takes at least {ratio:.1} times as many steps (its censored seeds \
-                 count as its budget; 95 % interval from {low:.1}).",
+                " To {level:.0} % success `{BASELINE}` takes at least {ratio:.2} times as many steps on average (its censored seeds \
+                 count as its budget; 95 % interval from {low:.2}).",
             );
         }
         _ => {}
@@ -231,7 +239,8 @@ fn evaluations(tables: &Tables, task: &str, differ: bool) -> Result<String> {
     let Some((_, first)) = grids.first() else { return Ok(String::new()) };
     if !differ {
         return Ok(format!(
-            "\nEvaluations: {}. The true step of {:.0} % success may be up to one evaluation interval earlier.\n",
+            "\nEvaluations: {}, always from the same starts. The step of {:.0} % success is rounded up to these steps; with so few episodes, \
+             it may also be several evaluations too late or too early.\n",
             one(first),
             100.0 * LEVEL
         ));

@@ -74,14 +74,15 @@ impl Tables {
     }
 
     /// Sentences that say which methods of a task do not have the same environment, or plan with another reward than the one that is
-    /// measured, as far as configurations are recorded.
+    /// measured, as far as configurations are recorded, and of which tasks different versions of the program made the runs.
     ///
     /// # Errors
     /// If the table lacks a column, or a configuration is not TOML.
     pub(in crate::study) fn differences_of_environments(&self) -> Result<Vec<String>> {
         let mut sentences = Vec::new();
         let mut first: BTreeMap<String, (String, toml::Table)> = BTreeMap::new();
-        let settings = settings(&self.runs()?)?;
+        let runs = self.runs()?;
+        let settings = settings(&runs)?;
         for (task, method) in self.tasks_and_methods()? {
             let of_method = |((of, name, _), _): &(&RunName, &toml::Table)| (of, name) == (&task, &method);
             let Some((_, settings)) = settings.iter().find(of_method) else { continue };
@@ -93,8 +94,8 @@ impl Tables {
                 && is_told(settings, &method) == Some(true)
             {
                 sentences.push(format!(
-                    "On `{task}`, `{method}` knows another reward (`{planned}`) than the one that is measured and that the others \
-                     receive."
+                    "On `{task}`, `{method}` plans with a different reward (`{planned}`) from the one that is measured and that the other \
+                     methods receive."
                 ));
             }
             match first.get(&task) {
@@ -106,6 +107,16 @@ impl Tables {
                     }));
                 }
             }
+        }
+        let mut versions: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+        for run in &runs {
+            versions.entry(&run.task).or_default().insert(&run.version);
+        }
+        for (task, _) in versions.into_iter().filter(|(_, versions)| versions.len() > 1) {
+            sentences.push(format!(
+                "The runs on `{task}` were made by different versions of the program (see the checklist). Whether these simulate alike, \
+                 the tables do not say."
+            ));
         }
         Ok(sentences)
     }
