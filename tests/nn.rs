@@ -22,7 +22,7 @@ fn near(what: &str, ours: f32, theirs: f64, tolerance: f64) {
     assert!((f64::from(ours) - theirs).abs() <= tolerance * theirs.abs().max(1.0), "{what}: {ours}, expected {theirs}");
 }
 
-/// Checks the gradient of `loss` (a function of several tensors) against central differences, for a
+/// Checks the gradient of `loss` (a function of several tensors) against extrapolated central differences, for a
 /// sample of the numbers of each tensor.
 fn check_gradients(
     inputs: Vec<Tensor3>,

@@ -294,7 +294,7 @@ fn a_verdict_needs_four_seeds() {
     // Nobody else was compared.
     assert!(
         report.contains(
-            "`pets` is given a reward function; of the methods that are not, `sac` is earliest, by step 1500."
+            "`pets` is given a reward function; of the methods that are not, `sac` is the earliest, by step 1500."
         ),
         "{report}"
     );
@@ -313,18 +313,21 @@ fn a_verdict_needs_four_seeds() {
 #[test]
 fn a_report_says_where_methods_do_not_have_the_same_environment() {
     let folder = study_by_hand(&[("pets", &[20], 500, [500, 1000]), ("sac", &[10], 500, [500, 1000])]);
-    let report_with = |pets: &str, sac: &str| {
+    let report_by = |versions: [&str; 2], pets: &str, sac: &str| {
         let mut runs = String::from("task,method,seed,version,configuration\n");
-        for (method, env) in [("pets", pets), ("sac", sac)] {
-            runs += &format!("pole,{method},0,0.1.0 (abc),\"agent = \"\"{method}\"\"\n[env]\n{env}\"\n");
+        for ((method, env), version) in [("pets", pets), ("sac", sac)].into_iter().zip(versions) {
+            runs += &format!("pole,{method},0,{version},\"agent = \"\"{method}\"\"\n[env]\n{env}\"\n");
         }
         std::fs::write(folder.path().join("runs.csv"), runs).expect("a writable folder");
         handful::study::report::write(folder.path(), folder.path()).expect("a study");
         report_in(folder.path())
     };
+    let report_with = |pets: &str, sac: &str| report_by(["0.1.0 (abc)"; 2], pets, sac);
     let shaped = "reward = \"\"shaped\"\"";
     let alike = report_with(shaped, shaped);
-    assert!(!alike.contains("another reward") && !alike.contains("Not the same environment"), "{alike}");
+    for absent in ["a different reward", "Not the same environment", "different versions"] {
+        assert!(!alike.contains(absent), "{alike}");
+    }
     let knows = report_with(&format!("{shaped}\nplanning_reward = \"\"log\"\""), shaped);
     assert!(
         knows.contains("On `pole`, `pets` plans with a different reward (`log`) from the one that is measured"),
@@ -334,6 +337,8 @@ fn a_report_says_where_methods_do_not_have_the_same_environment() {
     let differ = report_with(shaped, "reward = \"\"sparse\"\"");
     let expected = "that of `sac` on `pole` is not that of `pets` (its `reward` is \"sparse\", not \"shaped\")";
     assert!(differ.contains("**Not the same environment:**") && differ.contains(expected), "{differ}");
+    let older = report_by(["0.1.0 (abc)", "0.1.0 (def)"], shaped, shaped);
+    assert!(older.contains("The runs on `pole` were made by different versions of the program"), "{older}");
 }
 
 /// A success rate of zero for everyone says nothing about which method is better.
@@ -421,10 +426,10 @@ fn a_summary_says_what_its_seeds_can_tell() {
     for part in [
         "by step 1000 (median; 4 of 5 seeds reach it within 2000)",
         "| 1000 (12 s) | 2.5 |",
-        "- **pole**\n  - `pets` is earliest at 80 % success, by step 500 (median). `pets` is given a reward function; of the \
-         methods that are not, `dreamer` is earliest, by step 1000.\n  - Not every seed reaches 80 % within its budget, so there is no ratio of \
+        "- **pole**\n  - `pets` is the earliest to reach 80 % success, by step 500 (median). `pets` is given a reward function; of the \
+         methods that are not, `dreamer` is the earliest, by step 1000.\n  - Not every seed reaches 80 % within its budget, so there is no ratio of \
          steps to `sac`: `dreamer`. Fewer than 4 seeds of one of the two, too few to compare steps to 80 % with `sac`: `pets`.\n  - Fewer than 4 seeds of one of the two, \
-         too few to compare test success (after different budgets) with `sac`: `dreamer`, `pets`.\n",
+         too few to compare test success with `sac`: `dreamer`, `pets`. Not all methods have the same budget (see the checklist).\n",
         "one seed: the interval covers its test episodes, not what another seed would bring",
         "minus that of `sac`: +50.0 percentage points [",
         "takes at least 4.00 times as many steps on average",

@@ -15,8 +15,11 @@ pub(super) fn verdict(tables: &Tables, tasks: &[&str]) -> Result<String> {
         text += &on_task(tables, task)?;
     }
     if text.contains("ignificant") {
-        text += "\nA difference is called significant if neither the 95 % bootstrap interval nor the 95 % t interval includes equality. The \
-                 intervals are not corrected for the number of comparisons.\n";
+        text += &format!(
+            "\nA difference is called significant if both methods have at least {SEEDS:.0} seeds and neither the 95 % bootstrap interval nor \
+             the 95 % t interval includes equality. If `{BASELINE}` has censored seeds, the ratio of steps has no t interval, and the \
+             bootstrap interval decides alone. Nothing is corrected for the number of comparisons.\n"
+        );
     }
     Ok(text)
 }
@@ -59,7 +62,7 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
             None => {}
         }
     }
-    let mut text = format!("{} earliest at {level:.0} % success, by step {steps:.0} (median).", are(&first));
+    let mut text = format!("{} the earliest to reach {level:.0} % success, by step {steps:.0} (median).", are(&first));
     let told: Vec<&str> = first.iter().copied().filter(|method| informed.contains(method)).collect();
     if told.is_empty() {
         return Ok(text);
@@ -71,7 +74,7 @@ fn first_at_the_level(tables: &Tables, task: &str, learning: &[&str]) -> Result<
     text += &match earliest(&medians) {
         _ if told.len() < first.len() || uninformed.is_empty() => ".".into(),
         Some((steps, first)) => {
-            format!("; of {others}, {} earliest, by step {steps:.0}.", are(&first))
+            format!("; of {others}, {} the earliest, by step {steps:.0}.", are(&first))
         }
         None => format!("; of {others}, none reaches {level:.0} % in its median seed."),
     };
@@ -124,17 +127,10 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
         vec![Comparison { column: "return_minus_sac", equal: 0.0, measure, above: "higher", below: "lower" }]
     } else {
         let steps = format!("steps to {level:.0} %");
-        let success =
-            if budgets(tables, task)?.len() > 1 { "test success (after different budgets)" } else { "test success" };
+        let success = "test success".into();
         vec![
             Comparison { column: "sac_steps_ratio", equal: 1.0, measure: steps, above: "fewer", below: "more" },
-            Comparison {
-                column: "success_minus_sac",
-                equal: 0.0,
-                measure: success.into(),
-                above: "more",
-                below: "less",
-            },
+            Comparison { column: "success_minus_sac", equal: 0.0, measure: success, above: "more", below: "less" },
         ]
     };
     for Comparison { column, equal, measure, above, below } in comparisons {
@@ -162,11 +158,15 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
             groups[group].1.push(format!("`{method}`"));
         }
         let found = groups.into_iter().filter(|(_, methods)| !methods.is_empty());
-        let sentences: Vec<String> =
+        let mut sentences: Vec<String> =
             found.map(|(what, methods)| format!("{what} `{BASELINE}`: {}.", methods.join(", "))).collect();
-        if !sentences.is_empty() {
-            points.push(sentences.join(" "));
+        if sentences.is_empty() {
+            continue;
         }
+        if column != "sac_steps_ratio" && budgets(tables, task)?.len() > 1 {
+            sentences.push("Not all methods have the same budget (see the checklist).".into());
+        }
+        points.push(sentences.join(" "));
     }
     Ok(points)
 }
@@ -196,7 +196,10 @@ fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<
     }
     known.sort_by(|a, b| b.0.total_cmp(&a.0));
     let known: Vec<String> = known.iter().map(|(sparc, method)| format!("`{method}` {sparc:.1}")).collect();
-    Ok(Some(format!("Smoothness of the hand's path (SPARC, the smoothest first; not tested): {}.", known.join(", "))))
+    Ok(Some(format!(
+        "Smoothness of the hand's path in the test (SPARC, the smoothest first; differences not tested for significance): {}.",
+        known.join(", ")
+    )))
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use std::time::SystemTime;
 
 /// What stands between the versions that have worked on a run, where there is more than one.
-const BETWEEN: &str = ", ";
+pub(super) const BETWEEN: &str = ", ";
 
 /// What the program is made of.
 const SOURCES: [&str; 4] = ["src", "data/presets", "Cargo.toml", "Cargo.lock"];

@@ -54,9 +54,11 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
     let stem = figures::stem(task, method);
     let file = format!("{stem}-model.svg");
     if figures::model(tables, task, method, &to.join(&file))? {
+        let covered = !tables.model_curves(task, method, 1, "coverage90")?.is_empty();
+        let coverage = if covered { ", and the coverage of its 90 % interval" } else { "" };
         text += &format!(
             "![Open-loop prediction error of the model of {method} on the method's own evaluation episodes, in standard deviations of the \
-             change (root mean square over features; 1 is the error of predicting no change), and the coverage of its 90 % interval]({file})\n\n"
+             change (root mean square over features, median over start times; predicting no change has about 1){coverage}]({file})\n\n"
         );
     }
     let file = format!("{stem}-values.svg");
@@ -142,7 +144,7 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
         let show = |column: &str, text: fn(f64) -> String| value(column).map(|found| found.map_or("-".into(), text));
         let with_interval = |column: &str, kind: &str| -> Result<String> {
             Ok(match (value(column)?, interval(tables, task, &method, &format!("{column}{kind}"))?) {
-                // Where all resamples agree, there is no interval.
+                // Where all seeds, or all resamples, agree, there is no interval.
                 (Some(x), (Some(low), Some(high))) if low < high => format!("{x:.2} [{low:.2}, {high:.2}]"),
                 (Some(x), _) => format!("{x:.2}"),
                 _ => "-".into(),
