@@ -216,6 +216,8 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let oracle = success("lift", "lift", "oracle");
     let sparc = lift("oracle", "smoothness_sparc");
     quotes.push(("README.md", format!("| oracle (plans on the true simulator) | {oracle} | - | - | {sparc:.1} |")));
+    let opened = test_successes("door", "door", "oracle")[0];
+    quotes.push(("README.md", format!("the final reward counts 20 times | 3 x 40 | – | {opened} of 100 |")));
     let [pets, learned] = ["pets", "pets-learned"].map(|method| success("lift", "lift", method));
     let dreamer = ["success", "success_low", "success_high"].map(|column| 100.0 * lift("dreamer", column));
     let [dreamer, low, high] = dreamer.map(|rate| format!("{rate:.0}"));
