@@ -94,7 +94,10 @@ fn a_run_that_is_not_whole_is_left_out_by_name() {
         assert!(run.ends_with("debug on pole with seed 1") && why.contains(reason), "{run}: {why}");
         report::write(folder.path(), folder.path()).expect("a report");
         let text = fs::read_to_string(folder.path().join("report.md")).expect("a report");
-        assert!(text.contains("**no**: every run is included. Exceptions: `") && text.contains("seed 1"), "{text}");
+        assert!(
+            text.contains("**no**: every run that was found is included. Exceptions: `") && text.contains("seed 1"),
+            "{text}"
+        );
         // It does not come back in a joined study.
         let joined = Tables::read_all(&paths(&[&folder])).expect("two whole runs");
         assert_eq!(runs(&joined), ALL[..2]);

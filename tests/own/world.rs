@@ -63,7 +63,7 @@ fn a_study_of_the_puck_ends_in_a_report() {
         let text = handful::study::report::write(folder.path(), folder.path()).expect("a report");
         assert!(text.contains("puck") && text.contains("pets-learned"), "{text}");
         let report = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
-        let terms = "`pets` knows the reward as a function; for `copycat`, this is not known.";
+        let terms = "`pets` is given a reward function; for `copycat`, this is not known.";
         assert!(report.contains(terms), "{report}");
         assert!(folder.path().join("puck-learning.svg").exists());
     }
