@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use std::time::SystemTime;
 
 /// What stands between the versions that have worked on a run, where there is more than one.
-pub(super) const BETWEEN: &str = ", ";
+const BETWEEN: &str = ", ";
 
 /// What the program is made of.
 const SOURCES: [&str; 4] = ["src", "data/presets", "Cargo.toml", "Cargo.lock"];
@@ -40,6 +40,12 @@ fn is_newer(path: &Path, time: SystemTime) -> bool {
 /// All versions that have worked on a run, as one text.
 pub(super) fn joined<'a>(versions: impl IntoIterator<Item = &'a String>) -> String {
     versions.into_iter().map(String::as_str).collect::<Vec<_>>().join(BETWEEN)
+}
+
+/// The versions in a text that [`joined`] made.
+#[cfg(feature = "study")]
+pub(super) fn separated(versions: &str) -> impl Iterator<Item = &str> {
+    versions.split(BETWEEN).filter(|version| !version.is_empty())
 }
 
 /// Whether this text names one commit from which the program was built.

@@ -129,7 +129,7 @@ fn of_return(tables: &Tables, task: &str, method: &str) -> Result<String> {
         success => format!(", and succeeds in {success:.0} % of the test episodes"),
     };
     let measure = ("Return", "return_minus_sac", "");
-    let difference = difference(tables, task, method, measure, |x| format!("{:+.1}", (10.0 * x).round() / 10.0 + 0.0))?;
+    let difference = difference(tables, task, method, measure, signed)?;
     Ok(format!("- `{method}` has a mean test return of {mean:.1}{student}{success}.{difference}\n"))
 }
 
@@ -178,8 +178,7 @@ fn details(tables: &Tables, task: &str) -> Result<String> {
 fn against_the_baseline(tables: &Tables, task: &str, method: &str) -> Result<String> {
     let value = |column: &str| tables.value(task, method, column);
     let measure = ("Success", "success_minus_sac", " percentage points");
-    let mut text =
-        difference(tables, task, method, measure, |share| format!("{:+.1}", (1000.0 * share).round() / 10.0 + 0.0))?;
+    let mut text = difference(tables, task, method, measure, |share| signed(100.0 * share))?;
     let level = 100.0 * LEVEL;
     match (value("sac_steps_ratio")?, interval(tables, task, method, "sac_steps_ratio")?) {
         (Some(ratio), (Some(low), Some(high))) => {
@@ -222,6 +221,11 @@ fn difference(
         _ => format!(" [{from}, {to}]"),
     };
     Ok(format!(" {measure} from the same test starts, minus that of `{BASELINE}`: {value}{unit}{intervals}."))
+}
+
+/// A number with its sign and one decimal; zero is positive.
+fn signed(x: f64) -> String {
+    format!("{:+.1}", (10.0 * x).round() / 10.0 + 0.0)
 }
 
 /// The ends of an interval, as far as there are any.

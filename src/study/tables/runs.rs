@@ -11,7 +11,7 @@ use crate::error::{Error, Result, shortened};
 use crate::settings::value_at;
 use crate::study::config::upgrade_keys;
 use crate::study::folder::difference;
-use crate::study::version::BETWEEN;
+use crate::study::version::separated;
 
 /// Task, method and seed.
 pub(super) type RunName = (String, String, u64);
@@ -111,8 +111,7 @@ impl Tables {
         }
         let mut versions: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
         for run in &runs {
-            let known = run.version.split(BETWEEN).filter(|version| !version.is_empty());
-            versions.entry(&run.task).or_default().extend(known);
+            versions.entry(&run.task).or_default().extend(separated(&run.version));
         }
         for (task, _) in versions.into_iter().filter(|(_, versions)| versions.len() > 1) {
             sentences.push(format!(
