@@ -91,7 +91,8 @@
 //! - No global generator: random numbers come from streams that follow from a seed and a purpose ([`rng::stream`]). One seed
 //!   fixes a run bit for bit, with any number of threads, with AVX2 and with AVX-512.
 //! - Lengths are metres, angles radians, times seconds, unless a name says otherwise.
-//! - What can fail returns an [`error::Error`]; a function panics only where its documentation says so.
+//! - What can fail returns an [`error::Error`]; a function panics only where its documentation says so, or where tensors or slices
+//!   that it is given do not fit together.
 #![warn(missing_debug_implementations, missing_docs)]
 
 pub mod agent;

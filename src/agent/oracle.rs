@@ -1,7 +1,4 @@
 //! The oracle: a planner on the true simulator.
-//!
-//! It is not available to a real agent: it simulates action sequences in a copy of the environment in which it acts. Between an agent that plans in a learned model with the same planner and objective, and the oracle, lies the
-//! model's error alone. It is no upper bound on what agents can achieve: another planner or a longer horizon may do better.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -21,7 +18,8 @@ pub struct OracleConfig {
     pub planner: PlannerConfig,
     /// How plans become control.
     pub control: ControlConfig,
-    /// Weight of the terminal reward: the reward of a plan's last step counts 1 + `terminal_weight` times.
+    /// Weight of the terminal reward: the reward of a plan's last step counts 1 + `terminal_weight` times,
+    /// unless the plan ends the task.
     pub terminal_weight: f32,
 }
 
@@ -42,6 +40,10 @@ require fits(&[planner.candidates(), planner.horizon(), control.action_repeat]) 
 );
 
 /// Receding-horizon control with the true environment as the model, in any environment that can be restored.
+///
+/// It is not available to a real agent: it simulates action sequences in a copy of the environment in which it acts. An agent that plans
+/// in a learned model with the same planner and objective differs from it by the model's error alone. It is no upper bound on what agents
+/// can achieve: another planner or a longer horizon may do better.
 ///
 /// ```
 /// use handful::prelude::*;

@@ -51,7 +51,9 @@ pub trait Preset: DeserializeOwned + Default {
         Self::preset_for(method, "")
     }
 
-    /// The settings of a method for a task; those of [`Preset::preset`] if nothing differs for that task.
+    /// The settings of a method for a task; those of [`Preset::preset`] if nothing differs for that task. These are the agent's own:
+    /// the numbers of steps and episodes of a preset, and its options of the environment (`planning_reward`, for example, with which
+    /// `pets` plans on `push`), are in [`Registry::config`](crate::study::registry::Registry::config).
     ///
     /// # Errors
     /// As [`Preset::preset`].

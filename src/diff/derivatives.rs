@@ -129,7 +129,7 @@ pub fn gradient_forward<const N: usize, const M: usize>(
     slopes
 }
 
-/// The same by central differences of width `step`, a check on the others. Near contact, where the cost bends within
+/// The same by central differences, `step` to either side: a check on the others. Near contact, where the cost bends within
 /// `step`, it is wrong.
 #[doc(alias = "finite differences")]
 pub fn gradient_by_differences<const N: usize, const M: usize>(

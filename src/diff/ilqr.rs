@@ -1,18 +1,4 @@
-//! The iterative linear-quadratic regulator (iLQR; Li & Todorov 2004) with bounded actions (box-DDP; Tassa, Mansard & Todorov
-//! 2014).
-//!
-//! Each iteration linearises the dynamics and expands the cost to second order along the best trajectory so far. A backward
-//! pass then gives the best change of the actions, in closed form but for a small quadratic program at the bounds, and a
-//! forward pass with line search applies as much of it as lowers the cost. The backward pass is that of Tassa, Erez & Todorov
-//! (2012); regularisation is their first kind, on Q_uu.
-//!
-//! Second derivatives of the dynamics are left out (Gauss-Newton; with them it would be DDP), and so are mixed second
-//! derivatives of the cost, which is taken to be a function of the state plus one of the action.
-//!
-//! - W. Li, E. Todorov: "Iterative linear quadratic regulator design for nonlinear biological movement systems", ICINCO 2004.
-//! - Y. Tassa, T. Erez, E. Todorov: "Synthesis and stabilization of complex behaviors through online trajectory
-//!   optimization", IROS 2012.
-//! - Y. Tassa, N. Mansard, E. Todorov: "Control-limited differential dynamic programming", ICRA 2014.
+//! The iterative linear-quadratic regulator.
 
 use nalgebra::{SMatrix, SVector};
 use num_dual::Dual2SVec64;
@@ -64,7 +50,21 @@ pub struct Solution<const N: usize, const M: usize> {
     pub steps: usize,
 }
 
-/// The optimiser; the [module](crate::diff) has an example.
+/// The iterative linear-quadratic regulator (iLQR; Li & Todorov 2004) with bounded actions (box-DDP; Tassa, Mansard & Todorov
+/// 2014).
+///
+/// Each iteration linearises the dynamics and expands the cost to second order along the best trajectory so far. A backward
+/// pass then gives the best change of the actions, in closed form but for a small quadratic program at the bounds, and a
+/// forward pass with line search applies as much of it as lowers the cost. The backward pass is that of Tassa, Erez & Todorov
+/// (2012); regularisation is their first kind, on Q_uu. The [module](crate::diff) has an example.
+///
+/// Second derivatives of the dynamics are left out (Gauss-Newton; with them it would be DDP), and so are mixed second
+/// derivatives of the cost, which is taken to be a function of the state plus one of the action.
+///
+/// - W. Li, E. Todorov: "Iterative linear quadratic regulator design for nonlinear biological movement systems", ICINCO 2004.
+/// - Y. Tassa, T. Erez, E. Todorov: "Synthesis and stabilization of complex behaviors through online trajectory
+///   optimization", IROS 2012.
+/// - Y. Tassa, N. Mansard, E. Todorov: "Control-limited differential dynamic programming", ICRA 2014.
 #[doc(alias = "iLQR")]
 #[doc(alias = "iLQG")]
 #[doc(alias = "DDP")]

@@ -81,10 +81,10 @@ pub trait System<const N: usize, const M: usize>: Sync {
     /// The state after a control step.
     fn step<S: RealField + Copy>(&self, state: &SVector<S, N>, action: &SVector<S, M>) -> SVector<S, N>;
 
-    /// The cost of an action in a state.
+    /// The cost of an action in a state. [`Ilqr`] takes it to be a function of the state plus one of the action.
     fn cost<S: RealField + Copy>(&self, state: &SVector<S, N>, action: &SVector<S, M>) -> S;
 
-    /// The cost of the state that a rollout ends in.
+    /// The cost of the state that a rollout ends in. [`AnalyticPolicyGradient`] does not use it.
     fn final_cost<S: RealField + Copy>(&self, state: &SVector<S, N>) -> S;
 }
 

@@ -1,10 +1,4 @@
-//! Analytic policy gradients: a policy network trained by backpropagation through time, through a differentiable simulator.
-//!
-//! Each update rolls several systems out for a short horizon (the window), sums their costs, and differentiates the sum through
-//! simulator and network: the simulator's Jacobians come from dual numbers, the network's from dfdx's tape, on which both
-//! are recorded. The next window goes on from the states where this one ended, but no gradient flows between windows
-//! (truncated backpropagation). Short windows are the idea of SHAC (Xu et al. 2022); unlike there, no critic values the
-//! state that a window ends in.
+//! Analytic policy gradients.
 
 use dfdx::prelude::*;
 use dfdx::tensor::Cpu;
@@ -62,6 +56,14 @@ ranges!(AnalyticPolicyGradientConfig {
 });
 
 /// A policy network and the systems that it is trained on.
+///
+/// Analytic policy gradients: a policy network trained by backpropagation through time, through a differentiable simulator.
+///
+/// Each update rolls several systems out for a short horizon (the window), sums their costs, and differentiates the sum through
+/// simulator and network: the simulator's Jacobians come from dual numbers, the network's from dfdx's tape, on which both
+/// are recorded. The next window goes on from the states where this one ended, but no gradient flows between windows
+/// (truncated backpropagation). Short windows are the idea of SHAC (Xu et al. 2022); unlike there, no critic values the
+/// state that a window ends in.
 ///
 /// ```
 /// use handful::diff::{AnalyticPolicyGradient, AnalyticPolicyGradientConfig, PendulumSwing};

@@ -42,7 +42,8 @@ pub enum PrimitiveKind {
     Box(Vector3<f64>),
     /// A cylinder with rounded ends: radius, and half the length of the straight part along z.
     Capsule(f64, f64),
-    /// A cylinder along z: radius and half length.
+    /// A cylinder along z: radius and half length. As a part of a link it collides as the capsule inside it, or as a ball of its radius if it
+    /// is wider than long.
     Cylinder(f64, f64),
     /// A ball of the given radius.
     Ball(f64),

@@ -82,7 +82,7 @@ impl<E: Env> Checked<E> {
         &self.env
     }
 
-    /// The environment itself. Who resets it or steps it there does so unchecked, and the steps are not counted.
+    /// The environment itself. Its resets and steps are neither checked nor counted.
     pub fn env_mut(&mut self) -> &mut E {
         &mut self.env
     }

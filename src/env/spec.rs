@@ -66,7 +66,9 @@ pub enum Role {
     /// It has dynamics of its own, which models predict.
     #[default]
     Dynamic,
-    /// It is constant throughout an episode, as a goal is.
+    /// It is constant throughout an episode, as a goal is. The dynamics of an ensemble neither predict it nor read it, nor a difference
+    /// that contains it: a quantity on which the motion depends (a mass, a friction) is [`Role::Dynamic`]. SAC, latent models and
+    /// learned rewards do read it.
     Constant,
     /// It is the difference `minuend - subtrahend` of two other features, and computed from them.
     Difference {

@@ -32,12 +32,13 @@
 //! let config = EnsembleConfig { hidden: vec![16], first_steps: 100, ..EnsembleConfig::default() };
 //! let mut ensemble = Ensemble::new(world.spec(), config, &mut rng)?;
 //! ensemble.fit(&replay, &mut rng);
-//! let prediction = ensemble.dynamics().predict(&obs, &[0.5]);
-//! for (i, mean) in prediction.mean.iter().enumerate() {
-//!     let std = (prediction.aleatoric[i] + prediction.epistemic[i]).sqrt();
-//!     println!("{}: {mean:.3} ± {std:.3}", world.spec().observation[i].name);
+//! let dynamics = ensemble.dynamics();
+//! let prediction = dynamics.predict(&obs, &[0.5]);
+//! // It has the features that the ensemble predicts: of a pendulum all, of the arm those that are no goal and no difference.
+//! for (j, (i, _)) in dynamics.typical_changes().enumerate() {
+//!     let std = (prediction.aleatoric[j] + prediction.epistemic[j]).sqrt();
+//!     println!("{}: {:.3} ± {std:.3}", world.spec().observation[i].name, prediction.mean[j]);
 //! }
-//! # assert_eq!(prediction.mean.len(), world.spec().observation_size());
 //! # Ok::<(), handful::error::Error>(())
 //! ```
 

@@ -1,8 +1,4 @@
-//! The cross-entropy method (CEM; Rubinstein 1999, de Boer et al. 2005) as PETS uses it for planning (Chua et al. 2018,
-//! section 5 and Algorithm 1): sample sequences from a diagonal Gaussian, refit it to the best of them, repeat.
-//!
-//! As in the PETS authors' code: samples are truncated to two standard deviations, the variance is constrained so
-//! that they stay within the bounds, the refit is smoothed, and the mean is executed and kept as the next warm start.
+//! The cross-entropy method.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,8 +43,12 @@ ranges!(CemConfig {
 require elites <= population => "`elites` must not exceed `population`";
 );
 
-/// The cross-entropy method, the planner of PETS. It executes the mean of its last distribution rather than the best
-/// sample, whose return may be an outlier of the model's noise.
+/// The cross-entropy method (CEM; Rubinstein 1999, de Boer et al. 2005) as PETS uses it for planning (Chua et al. 2018,
+/// section 5 and Algorithm 1): sample sequences from a diagonal Gaussian, refit it to the best of them, repeat.
+///
+/// As in the PETS authors' code: samples are truncated to two standard deviations, the variance is constrained so
+/// that they stay within the bounds, the refit is smoothed, and the mean is executed and kept as the next warm start. The best
+/// sample is not executed, because its return may be an outlier of the model's noise.
 #[doc(alias = "CEM")]
 #[doc(alias = "cross-entropy method")]
 #[derive(Clone, Debug)]

@@ -23,11 +23,11 @@ pub struct ControlConfig {
     pub replan_every: usize,
     /// The actions between one planned action and the next, if `action_repeat` is more than 1.
     pub interpolation: Interpolation,
-    /// Subtracted from a plan's return, times the sum of its squared actions, over control steps: where the reward is
+    /// A plan's return is reduced by this times the sum of its squared actions over all control steps: where the reward is
     /// indifferent, the arm rests.
     #[doc(alias = "control cost")]
     pub effort_penalty: f32,
-    /// Subtracted from a plan's return, times the sum of the squared changes from one action to the next, over control steps,
+    /// A plan's return is reduced by this times the sum of the squared changes from one action to the next over all control steps,
     /// the first from the last executed action: what makes planned motion smooth.
     #[doc(alias = "jerk")]
     #[doc(alias = "smoothness")]

@@ -1,7 +1,4 @@
-//! Gradient shooting: gradient ascent on the actions themselves, by Adam through the unrolled objective.
-//!
-//! Gradients exploit the errors of a learned model more effectively than sampling does, they are zero or misleading
-//! across contacts, and they explode over long horizons; so there are several starts, clipped gradients, and few steps.
+//! Gradient shooting.
 
 use serde::{Deserialize, Serialize};
 
@@ -48,7 +45,10 @@ ranges!(GradientConfig {
     noise_beta: 0.0..=10.0,
 });
 
-/// Gradient ascent from several starts.
+/// Gradient shooting: gradient ascent on the actions themselves, by Adam through the unrolled objective.
+///
+/// Gradients exploit the errors of a learned model more effectively than sampling does, they are zero or misleading
+/// across contacts, and they explode over long horizons; so there are several starts, clipped gradients, and few steps.
 #[doc(alias = "gradient shooting")]
 #[derive(Clone, Debug)]
 pub struct Gradient {

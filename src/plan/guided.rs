@@ -1,15 +1,4 @@
-//! The planner of TD-MPC2 (Hansen et al. 2024, section 3.2): MPPI over the best candidates, whose deviation adapts, guided by
-//! sequences that the objective proposes, such as those of a learned policy.
-//!
-//! ```text
-//! mean = what is left of the last plan, deviation = its maximum
-//! repeat `iterations` times:
-//!     candidates = proposals and samples of N(mean, deviation^2)
-//!     R = their returns; keep the `elites` best
-//!     w = exp(R / temperature) / sum exp(R / temperature)           over the elites
-//!     mean = sum w a;  deviation = sqrt(sum w (a - mean)^2), within its bounds
-//! execute an elite, drawn with probability w, or the mean
-//! ```
+//! The planner of TD-MPC2.
 
 use serde::{Deserialize, Serialize};
 
@@ -76,6 +65,19 @@ require min_deviation <= max_deviation => "`min_deviation` must not exceed `max_
 
 /// MPPI over elites, guided by proposals: the planner of TD-MPC2.
 ///
+/// The planner of TD-MPC2 (Hansen et al. 2024, section 3.2): MPPI over the best candidates, whose deviation adapts, guided by
+/// sequences that the objective proposes, such as those of a learned policy.
+///
+/// ```text
+/// mean = what is left of the last plan, deviation = its maximum
+/// repeat `iterations` times:
+///     candidates = proposals and samples of N(mean, deviation^2)
+///     R = their returns; keep the `elites` best
+///     w = exp(R / temperature) / sum exp(R / temperature)           over the elites
+///     mean = sum w a;  deviation = sqrt(sum w (a - mean)^2), within its bounds
+/// execute an elite, drawn with probability w, or the mean
+/// ```
+///
 /// ```
 /// use handful::plan::{ActionSequences, GuidedConfig, GuidedMppi, Objective, Planner};
 /// use handful::rng;
@@ -124,7 +126,7 @@ impl GuidedMppi {
         &self.deviation[..self.action_size]
     }
 
-    /// The mean of the last plan's elites, `[horizon, actions]`.
+    /// The mean of the last plan's elites, moved on by [`shift`](Planner::shift), `[horizon, actions]`: where the next search starts.
     pub fn mean(&self) -> &[f64] {
         &self.mean
     }

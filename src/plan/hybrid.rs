@@ -1,11 +1,11 @@
-//! A hybrid of zeroth-order and gradient search: iCEM searches globally, a few steps of gradient ascent refine its plan,
-//! and the refined plan is kept only if it is better when both are evaluated again, side by side. (In the spirit of
-//! Bharadhwaj et al. 2020, who take gradient steps on the samples of every CEM iteration.)
+//! iCEM, refined by gradient ascent.
 
 use serde::{Deserialize, Serialize};
 
 use super::gradient::ascend;
-use super::{ActionSequences, GradientConfig, Icem, IcemConfig, Objective, Plan, PlanObserver, Planner};
+use super::{
+    ActionSequences, GradientConfig, Icem, IcemConfig, Iteration, Objective, Plan, PlanObserver, Planner, best,
+};
 use crate::rng::Rng;
 use crate::settings::{must_hold, ranges};
 
@@ -30,6 +30,10 @@ impl Default for HybridConfig {
 ranges!(HybridConfig { icem: Nested, iterations: 1..=10_000, rate: 1e-6..=10.0 });
 
 /// iCEM, refined by gradient ascent.
+///
+/// iCEM searches globally, a few steps of gradient ascent refine its plan,
+/// and the refined plan is kept only if it is better when both are evaluated again, side by side. (In the spirit of
+/// Bharadhwaj et al. 2020, who take gradient steps on the samples of every CEM iteration.)
 #[derive(Clone, Debug)]
 pub struct Hybrid {
     icem: Icem,
@@ -56,13 +60,20 @@ impl Planner for Hybrid {
     }
 
     fn plan(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Plan {
-        let found = self.icem.plan(objective, observer, rng);
+        let mut searched = 0;
+        let mut searching = |iteration: &Iteration| {
+            searched = iteration.index + 1;
+            observer(iteration);
+        };
+        let found = self.icem.plan(objective, &mut searching, rng);
         let sequence =
             |values: Vec<f32>| ActionSequences { horizon: self.ascent.horizon, actions: self.action_size, values };
-        let climbed = ascend(sequence(found.actions.clone()), &self.ascent, objective, observer);
+        let climbed = ascend(sequence(found.actions.clone()), &self.ascent, objective, &mut |iteration| {
+            observer(&Iteration { index: searched + iteration.index, ..*iteration });
+        });
         // Both again in one batch, and so with common random numbers.
         let returns = objective.returns(&sequence([found.actions.clone(), climbed.actions.clone()].concat()));
-        if returns[1] > returns[0] {
+        if best(&returns, 1)[0] == 1 {
             self.icem.adopt(&climbed.actions);
             return Plan { best_return: returns[1], ..climbed };
         }

@@ -1,13 +1,4 @@
-//! iCEM (Pinneri et al. 2020, Algorithm 1): the cross-entropy method with
-//! - coloured noise of exponent beta along the horizon, clipped to the bounds,
-//! - elites that are kept from iteration to iteration, and shifted from plan to plan,
-//! - a population that decays: N_i = max(N_{i-1} / gamma, 2K),
-//! - the mean among the candidates of the last iteration, and the best candidate as the plan to execute.
-//!
-//! Deviations: kept elites are evaluated again with the other candidates, since the return that a stochastic model
-//! predicted for them may have been a favourable draw; a shifted elite repeats its last action instead of drawing a new
-//! one; the momentum averages variances, as in CEM, where the authors' code averages standard deviations; the mean comes on
-//! top of the samples, where it takes the place of one; `execute_mean` executes the mean, as PETS does.
+//! The improved cross-entropy method.
 
 use serde::{Deserialize, Serialize};
 
@@ -78,7 +69,16 @@ ranges!(IcemConfig {
 require elites <= population => "`elites` must not exceed `population`";
 );
 
-/// The improved cross-entropy method.
+/// The improved cross-entropy method (iCEM; Pinneri et al. 2020, Algorithm 1): CEM with
+/// - coloured noise of exponent beta along the horizon, clipped to the bounds,
+/// - elites that are kept from iteration to iteration, and shifted from plan to plan,
+/// - a population that decays: N_i = max(N_{i-1} / gamma, 2K),
+/// - the mean among the candidates of the last iteration, and the best candidate as the plan to execute.
+///
+/// Deviations: kept elites are evaluated again with the other candidates, since the return that a stochastic model
+/// predicted for them may have been a favourable draw; a shifted elite repeats its last action instead of drawing a new
+/// one; the momentum averages variances, as in CEM, where the authors' code averages standard deviations; the mean comes on
+/// top of the samples, where it takes the place of one; `execute_mean` executes the mean, as PETS does.
 #[doc(alias = "iCEM")]
 #[doc(alias = "cross-entropy method")]
 #[derive(Clone, Debug)]

@@ -1,11 +1,4 @@
-//! Model predictive path integral control (MPPI; Williams et al. 2017) in the form of PDDM (Nagabandi et
-//! al. 2019, "Filtering and Reward-Weighted Refinement"): the new mean is the average of all samples, weighted by the
-//! exponential of their returns, and the samples are low-pass filtered along the horizon.
-//!
-//! Deviations: several iterations for each plan; the temperature is relative to the standard deviation of the returns;
-//! MPPI's term for the control cost of the noise is left out, as in PDDM; and the filter runs over mean plus noise,
-//! starting from the action executed last, as in the PDDM authors' code (the paper filters the noise alone), and is clipped to
-//! the bounds at each step (in their code, at the end).
+//! Model predictive path integral control.
 
 use serde::{Deserialize, Serialize};
 
@@ -48,7 +41,14 @@ ranges!(MppiConfig {
     temperature: 1e-6..=1e6,
 });
 
-/// Model predictive path integral control.
+/// Model predictive path integral control (MPPI; Williams et al. 2017) in the form of PDDM (Nagabandi et
+/// al. 2019, "Filtering and Reward-Weighted Refinement"): the new mean is the average of all samples, weighted by the
+/// exponential of their returns, and the samples are low-pass filtered along the horizon.
+///
+/// Deviations: several iterations for each plan; the temperature is relative to the standard deviation of the returns;
+/// MPPI's term for the control cost of the noise is left out, as in PDDM; and the filter runs over mean plus noise,
+/// starting from the action executed last, as in the PDDM authors' code (the paper filters the noise alone), and is clipped to
+/// the bounds at each step (in their code, at the end).
 #[doc(alias = "MPPI")]
 #[doc(alias = "PDDM")]
 #[doc(alias = "model predictive path integral")]

@@ -117,8 +117,8 @@ impl SequenceReplay {
         }
     }
 
-    /// Ends the current episode with its last observation, unless it has ended already: for what cannot be told by a last
-    /// [`push`](SequenceReplay::push), because the last action has no whole step.
+    /// Ends the current episode with its last observation, unless it has ended already: where there is no last transition to
+    /// [`push`](SequenceReplay::push), because the time limit cut the last decision short.
     ///
     /// # Panics
     /// If the observation has the wrong length.

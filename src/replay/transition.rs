@@ -80,6 +80,11 @@ impl Batch {
     }
 }
 
+const GOES_ON: f32 = 0.0;
+const TERMINATED: f32 = 1.0;
+/// Older checkpoints have [`GOES_ON`] here.
+const CUT_OFF: f32 = 2.0;
+
 /// A ring buffer of the latest transitions.
 #[doc(alias = "replay buffer")]
 #[doc(alias = "experience replay")]
@@ -90,7 +95,7 @@ pub struct ReplayBuffer {
     capacity: usize,
     /// Transitions added so far, those that were overwritten included.
     pushed: u64,
-    /// One row for each transition: obs, action, reward, next_obs, terminated.
+    /// One row for each transition: obs, action, reward, next_obs, and how it ended: [`GOES_ON`], [`TERMINATED`] or [`CUT_OFF`].
     rows: Vec<f32>,
 }
 
@@ -129,8 +134,12 @@ impl ReplayBuffer {
             t.obs.len() == obs && t.next_obs.len() == obs && t.action.len() == action,
             "the sizes differ from those of the buffer"
         );
-        let tail = [f32::from(t.terminated)];
-        let row = t.obs.iter().chain(&t.action).chain([&t.reward]).chain(&t.next_obs).chain(&tail);
+        let end = match t {
+            Transition { terminated: true, .. } => TERMINATED,
+            Transition { truncated: true, .. } => CUT_OFF,
+            _ => GOES_ON,
+        };
+        let row = t.obs.iter().chain(&t.action).chain([&t.reward]).chain(&t.next_obs).chain([&end]);
         if self.len() < self.capacity {
             self.rows.extend(row);
         } else {
@@ -138,6 +147,16 @@ impl ReplayBuffer {
             self.rows[from..].iter_mut().zip(row).for_each(|(old, new)| *old = *new);
         }
         self.pushed += 1;
+    }
+
+    /// Ends the episode after the last transition, because a decision that the time limit cut short is left out.
+    pub(crate) fn close(&mut self) {
+        let (last, width) = ((self.pushed.max(1) - 1) % self.capacity as u64, self.width());
+        if let Some(end) = self.rows.get_mut((last as usize + 1) * width - 1)
+            && *end == GOES_ON
+        {
+            *end = CUT_OFF;
+        }
     }
 
     /// The transition at index `i`. Once the buffer is full, indices are not in the order of time.
@@ -148,7 +167,8 @@ impl ReplayBuffer {
         let width = self.width();
         let (obs, rest) = self.rows[i * width..][..width].split_at(self.observation_size);
         let (action, rest) = rest.split_at(self.action_size);
-        let (reward, next_obs, terminated) = (rest[0], &rest[1..=self.observation_size], rest[rest.len() - 1] > 0.5);
+        let (reward, next_obs, terminated) =
+            (rest[0], &rest[1..=self.observation_size], rest[rest.len() - 1] == TERMINATED);
         Row { obs, action, reward, next_obs, terminated }
     }
 
@@ -191,13 +211,14 @@ impl ReplayBuffer {
         std::iter::successors(Some(i), |i| self.successor(*i)).map(|i| self.row(i))
     }
 
-    /// The index of the transition after the one at index `i`, if it belongs to the same episode: if it starts from the
-    /// observation at which the other ended.
+    /// The index of the transition after the one at index `i`, if it belongs to the same episode: if that did not end, and it starts
+    /// from the observation at which the other ended (it does not, where an episode was given up before its end).
     fn successor(&self, i: usize) -> Option<usize> {
         let next = (i + 1) % self.capacity;
         // After the newest comes the oldest, or nothing.
         let newest = next == self.next();
-        (!newest && !self.row(i).terminated && self.row(next).obs == self.row(i).next_obs).then_some(next)
+        let goes_on = self.rows[(i + 1) * self.width() - 1] == GOES_ON;
+        (!newest && goes_on && self.row(next).obs == self.row(i).next_obs).then_some(next)
     }
 
     /// How many transitions may have been added, from those held.
@@ -272,6 +293,21 @@ mod tests {
             };
             assert_eq!(of_row, expected);
         }
+    }
+
+    /// Every episode is one step from 0 back to 0, cut off by the time limit, or followed by a decision that is left out.
+    #[test]
+    fn an_episode_ends_even_where_the_next_one_starts() {
+        let mut buffer = ReplayBuffer::new(1, 1, 10);
+        for truncated in [true, false, true, false] {
+            let (obs, next_obs) = (vec![0.0], vec![0.0]);
+            buffer.push(&Transition { obs, action: vec![0.0], reward: 1.0, next_obs, terminated: false, truncated });
+            if !truncated {
+                buffer.close();
+            }
+        }
+        let batch = buffer.sample_n_step(50, 3, 1.0, &mut rng::stream(0, "one step each"));
+        assert_eq!((batch.rewards, batch.terminated), (vec![1.0; 50], vec![0.0; 50]));
     }
 
     /// Each transition keeps its serial number while it is in the ring, and in a checkpoint; an old checkpoint, which does

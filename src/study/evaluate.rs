@@ -1,4 +1,4 @@
-//! The evaluation protocol: the same initial states for every method, deterministic actions.
+//! The evaluation protocol: the same initial states for every method, no exploration noise.
 //!
 //! ```
 //! use handful::prelude::*;

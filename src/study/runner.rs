@@ -197,8 +197,8 @@ pub fn carry_out(
 /// own, the others go on: if it diverges, its environment fails or breaks its contract, or its agent acts in a way that is refused.
 ///
 /// # Errors
-/// [`Error::Run`] for the first run that failed so, when the others are complete. Any other error of a run, such as a full disk; the others
-/// are then stopped and saved.
+/// [`Error::Run`] for the first run that failed so, when the others are complete. Any other error of a run, such as a full disk; `stop`
+/// is then set, as by a caller who wants all runs to end with their episode and be saved, and so it stays.
 pub fn carry_out_all(
     registry: &Registry,
     runs: &[(RunConfig, PathBuf)],

@@ -27,7 +27,7 @@ const CUT_OFF: f64 = 10.0;
 const THRESHOLD: f64 = 0.05;
 
 /// Smoothness of a path of hand positions (m) sampled every `dt` seconds: [`sparc`] and [`ldlj`], both dimensionless,
-/// nearer to zero for a smoother movement. `None` where nothing moves.
+/// and larger (less negative) for a smoother movement. `None` where nothing moves.
 #[doc(alias = "smoothness")]
 #[doc(alias = "jerk")]
 pub fn of_path(path: &[[f64; 3]], dt: f64) -> Option<(f64, f64)> {

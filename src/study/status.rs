@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 use super::config::RunConfig;
 use super::folder::{is_complete, is_open};
 
-/// What becomes of a run at the moment.
+/// The present state of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunState {
     /// Not begun.
@@ -45,13 +45,13 @@ pub struct RunStatus {
     pub method: String,
     /// The seed.
     pub seed: u64,
-    /// What becomes of it.
+    /// Its state.
     pub state: RunState,
     /// Environment steps that have been saved; a running one is some seconds ahead of that.
     pub step: usize,
     /// Environment steps that it is to have.
     pub steps: usize,
-    /// Seconds that they took.
+    /// Seconds that the saved steps took.
     pub seconds: f64,
 }
 

@@ -1,24 +1,4 @@
-//! PETS: probabilistic ensembles with trajectory sampling (Chua et al. 2018, Algorithm 1).
-//!
-//! ```text
-//! act at random for a while                                            warm_up
-//! repeat:
-//!     fit the ensemble of probabilistic networks to all transitions    Pets::update, Pets::fit
-//!     for each time step until the next fit:                           Pets::act
-//!         search for action sequences (CEM, or another planner):       RecedingHorizon
-//!             propagate particles through the ensemble (TS-inf, ...)   Imagination
-//!             score = mean over particles of summed rewards            EnsembleObjective
-//!         execute the first action of the best sequence
-//!         record the transition                                        Pets::observe
-//! ```
-//!
-//! This module wires them together: the ensemble and its imagination are in [`crate::model`], the search is in
-//! [`crate::plan`].
-//!
-//! Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
-//! actions at the beginning are coloured noise; those of the [ensemble](crate::model::ensemble). Risk measures other than the
-//! mean, a penalty or a bonus for disagreement, exploration by posterior sampling, a reward for a plan's last state, a learned
-//! reward, and a model of decisions that hold an action for several time steps are optional.
+//! PETS: planning in an ensemble of probabilistic networks.
 
 mod checkpoint;
 mod config;
@@ -53,6 +33,28 @@ type DynReward = dyn KnownReward + Send + Sync;
 const SHOWN: usize = 8;
 
 /// The PETS agent: an ensemble of models, a planner, and a replay buffer.
+///
+/// PETS: probabilistic ensembles with trajectory sampling (Chua et al. 2018, Algorithm 1).
+///
+/// ```text
+/// act at random for a while                                            warm_up
+/// repeat:
+///     fit the ensemble of probabilistic networks to all transitions    Pets::update, Pets::fit
+///     for each time step until the next fit:                           Pets::act
+///         search for action sequences (CEM, or another planner):       RecedingHorizon
+///             propagate particles through the ensemble (TS-inf, ...)   Imagination
+///             score = mean over particles of summed rewards            EnsembleObjective
+///         execute the first action of the best sequence
+///         record the transition                                        Pets::observe
+/// ```
+///
+/// This module wires them together: the ensemble and its imagination are in [`crate::model`], the search is in
+/// [`crate::plan`].
+///
+/// Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
+/// actions at the beginning are coloured noise; those of the [ensemble](crate::model::ensemble). Risk measures other than the
+/// mean, a penalty or a bonus for disagreement, exploration by posterior sampling, a reward for a plan's last state, a learned
+/// reward, and a model of decisions that hold an action for several time steps are optional.
 ///
 /// ```
 /// use std::sync::Arc;
@@ -163,8 +165,8 @@ impl Pets {
         self.dynamics.as_ref()
     }
 
-    /// Fits the model to the replay buffer, and plans in it from the next action on. Returns `model_loss` (the mean negative
-    /// log-likelihood of normalised targets), `model_steps` (gradient steps) and `model_error` (the mean squared error on
+    /// Fits the model to the replay buffer, and plans in it from the next action on. Returns `model_loss` (the mean training
+    /// loss, comparable only between ensembles with the same `beta`), `model_steps` (gradient steps) and `model_error` (the mean squared error on
     /// held-out transitions, in normalised units) and, with a learned reward, `reward_error` (the same of its networks).
     ///
     /// # Panics

@@ -39,9 +39,11 @@ impl Agent for Sac {
     }
 
     fn observe(&mut self, transition: &Transition) {
-        // A decision that the time limit cuts short is left out: it tells nothing about a whole one.
-        if let Some(Over::Whole(decision)) = self.decision.join(transition, self.config.action_repeat) {
-            self.replay.push(&decision);
+        match self.decision.join(transition, self.config.action_repeat) {
+            Some(Over::Whole(decision)) => self.replay.push(&decision),
+            // It tells nothing about a whole decision.
+            Some(Over::Short(_)) => self.replay.close(),
+            None => {}
         }
         self.observed += 1;
         if transition.terminated || transition.truncated {

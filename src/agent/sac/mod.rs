@@ -1,17 +1,4 @@
-//! Soft actor-critic (SAC) with automatic temperature (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and
-//! Applications", arXiv:1812.05905, Algorithm 1; equation numbers below are that paper's). The model-free baseline.
-//!
-//! One update: [`Sac::learn`] samples a minibatch from the replay buffer, moves the critics towards the soft Bellman
-//! target, the policy up the critics' values and its entropy, the temperature towards the target entropy, and the target
-//! critics towards the critics.
-//!
-//! Deviations: log standard deviations are squashed into [-5, 2] as in CleanRL; the temperature's loss is
-//! -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
-//! and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; inputs may have a
-//! group lasso; truncated episodes are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the
-//! mean of the critics for the policy where we take the smallest); goals may be relabelled in hindsight; the policy may explore
-//! with coloured noise, and may be updated less often than the critics; an action may be held for several time steps; gradients
-//! may be clipped.
+//! Soft actor-critic, the model-free baseline.
 
 mod acting;
 mod backup;
@@ -44,6 +31,21 @@ use crate::rng::{self, Rng};
 use crate::settings::Ranges;
 
 /// The SAC agent: a policy, its critics and target critics, a temperature, and a replay buffer.
+///
+/// Soft actor-critic (SAC) with automatic temperature (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and
+/// Applications", arXiv:1812.05905, Algorithm 1; equation numbers below are that paper's). The model-free baseline.
+///
+/// One update: [`Sac::learn`] samples a minibatch from the replay buffer, moves the critics towards the soft Bellman
+/// target, the policy up the critics' values and its entropy, the temperature towards the target entropy, and the target
+/// critics towards the critics.
+///
+/// Deviations: log standard deviations are squashed into [-5, 2] as in CleanRL; the temperature's loss is
+/// -ln(alpha) (log pi + target) as in Stable-Baselines3; critics may have layer normalisation; observations are shifted
+/// and scaled by the environment's own [`Feature`](crate::env::Feature)s, or read as latent models read them; inputs may have a
+/// group lasso; truncated episodes are bootstrapped; returns may be of n steps; critics may have dropout (DroQ, which takes the
+/// mean of the critics for the policy where we take the smallest); goals may be relabelled in hindsight; the policy may explore
+/// with coloured noise, and may be updated less often than the critics; an action may be held for several time steps; gradients
+/// may be clipped.
 ///
 /// ```
 /// use handful::prelude::*;
@@ -191,7 +193,7 @@ impl Sac {
     /// actions, in nats) and `temperature`; `critic_gradient` and `policy_gradient` are norms before clipping.
     ///
     /// # Panics
-    /// If nothing has been observed.
+    /// If no whole decision has been observed.
     #[doc(alias = "Bellman")]
     pub fn learn(&mut self) -> Losses {
         let SacConfig { batch, n_step, .. } = self.config;

@@ -75,11 +75,6 @@ impl Checkpoint for TdMpc2 {
     fn load_training_state(&mut self, state: &Weights) -> Result<()> {
         let (own, planner) = (state.rng("rng")?, state.rng("planner rng")?);
         let &[scale] = state.get_within("scale", [1, 1, 1], 0.0..=f32::MAX)? else { unreachable!("one number") };
-        // At most the updates of the warm-up are due, one more for the rounding of their sum.
-        let due = self.config.warm_up as f32 * self.config.updates_per_step * 1.01 + 1.0;
-        let &[update_credit] = state.get_within("update_credit", [1, 1, 1], 0.0..=due)? else {
-            unreachable!("one number")
-        };
         state.load_module("target", &mut self.networks.target)?;
         self.model_optimiser.load(state, "model", &self.networks.model)?;
         self.policy_optimiser.load(state, "policy", &self.networks.policy)?;
@@ -87,6 +82,11 @@ impl Checkpoint for TdMpc2 {
         self.replay.load(state, "replay")?;
         let most = most_observed(self.replay.most_pushes(), self.config.action_repeat);
         self.observed = state.count("counts", 0..=most)? as usize;
+        // At most the updates for all time steps are due, one more for the rounding of their sum.
+        let due = self.observed as f32 * self.config.updates_per_step * 1.01 + 1.0;
+        let &[update_credit] = state.get_within("update_credit", [1, 1, 1], 0.0..=due)? else {
+            unreachable!("one number")
+        };
         self.scale = RunningScale::new(scale.max(f32::MIN_POSITIVE));
         self.update_credit = update_credit;
         self.rng = own;

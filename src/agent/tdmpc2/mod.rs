@@ -1,22 +1,4 @@
-//! TD-MPC2 (Hansen et al. 2024, "TD-MPC2: Scalable, Robust World Models for Continuous Control"): model predictive control in
-//! the latent space of a model without a decoder, with a learned value at the plan's end.
-//!
-//! ```text
-//! act at random for a while                                               warm_up
-//! repeat at each time step:
-//!     z = h(o); search for action sequences by MPPI over elites,          Controller, GuidedMppi
-//!         among candidates proposed by the policy,                        LatentReturns
-//!         scored by predicted rewards and the value of the last state
-//!     execute the first action of an elite; record the transition         TdMpc2::observe
-//!     learn latent dynamics, rewards, values and policy from slices       TdMpc2::learn
-//! ```
-//!
-//! The model is in [`crate::model::implicit`], the planner in [`crate::plan`]; an update is in `update.rs`. Deviations: no
-//! dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
-//! observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
-//! action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, another unit of rewards,
-//! n-step targets, coloured noise for exploration, executing the mean of a plan, always or in evaluations, and costs of actions in
-//! evaluations.
+//! TD-MPC2: planning in a latent space, with a learned value at the end.
 
 mod checkpoint;
 mod config;
@@ -49,6 +31,26 @@ const SHOWN: usize = 8;
 const PROBE_RATE: f32 = 1e-3;
 
 /// The agent: model, policy, target critics, planners, and the replay buffer that it learns from.
+///
+/// TD-MPC2 (Hansen et al. 2024, "TD-MPC2: Scalable, Robust World Models for Continuous Control"): model predictive control in
+/// the latent space of a model without a decoder, with a learned value at the plan's end.
+///
+/// ```text
+/// act at random for a while                                               warm_up
+/// repeat at each time step:
+///     z = h(o); search for action sequences by MPPI over elites,          Controller, GuidedMppi
+///         among candidates proposed by the policy,                        LatentReturns
+///         scored by predicted rewards and the value of the last state
+///     execute the first action of an elite; record the transition         TdMpc2::observe
+///     learn latent dynamics, rewards, values and policy from slices       TdMpc2::learn
+/// ```
+///
+/// The model is in [`crate::model::implicit`], the planner in [`crate::plan`]; an update is in `update.rs`. Deviations: no
+/// dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
+/// observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
+/// action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, another unit of rewards,
+/// n-step targets, coloured noise for exploration, executing the mean of a plan, always or in evaluations, and costs of actions in
+/// evaluations.
 ///
 /// ```
 /// use handful::prelude::*;
@@ -261,10 +263,11 @@ impl Agent for TdMpc2 {
         if self.observed < self.config.warm_up {
             return None;
         }
-        let due = self.update_credit.floor();
-        self.update_credit -= due;
+        let due = self.update_credit.floor() as usize;
+        // What cannot be made yet, because no episode is long enough, stays due.
+        let update = |_| self.learn().inspect(|_| self.update_credit -= 1.0);
         // Inside the thread pool: a parallel section entered from outside hands its work over each time.
-        rayon::scope(|_| (0..due as usize).map_while(|_| self.learn()).last())
+        rayon::scope(|_| (0..due).map_while(update).last())
     }
 }
 

@@ -38,7 +38,8 @@ impl Physics {
         multibody.update_rigid_bodies(bodies, true);
     }
 
-    /// Advances by one [`TIMESTEP`] under joint torques (N m) and finger forces (N, positive opens).
+    /// Advances by one [`TIMESTEP`] under joint torques (N m) and finger forces (N, positive opens). The arm has no weight: torques are
+    /// those beyond what would carry it. They are not limited here.
     pub fn step(&mut self, torques: &JointVector, finger_forces: [f64; 2]) {
         let joints = self.joint_state();
         self.watch_limits(&joints);

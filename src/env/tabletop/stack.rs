@@ -24,7 +24,8 @@ const HAND_TO_CUBE: usize = BASE + 12;
 const CUBE_TO_BASE: usize = HAND_TO_CUBE + 3;
 const TOUCHING: usize = CUBE_TO_BASE + 3;
 
-/// Put the red cube on the green one: robosuite's Stack, with its numbers (but see [`TableTask::horizon`]).
+/// Put the red cube on the green one: robosuite's Stack, with its numbers. An episode is shorter than in its
+/// published runs.
 #[derive(Clone, Copy, Debug)]
 pub struct Stack;
 

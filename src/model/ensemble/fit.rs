@@ -23,8 +23,8 @@ const MAX_TEMPERATURE: f32 = 5.0;
 pub struct Fit {
     /// Gradient steps of each member.
     pub steps: usize,
-    /// Training loss, mean over members and steps: negative log-likelihood of the normalised targets, as in
-    /// [`bounded_nll`](crate::nn::bounded_nll).
+    /// Training loss, mean over members and steps: [`bounded_nll`](crate::nn::bounded_nll) of the normalised targets, with the
+    /// ensemble's `beta`.
     pub loss: f32,
     /// Validation error of each member: mean squared error of its mean, in normalised units (predicting the mean change
     /// has error 1). Empty without validation set.

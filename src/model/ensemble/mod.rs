@@ -191,7 +191,7 @@ impl Ensemble {
     /// Loads what [`Ensemble::weights`] returned.
     ///
     /// # Errors
-    /// If an array is missing or has another shape, as with other settings, or a number is none that was saved.
+    /// If an array is missing or has another shape, as with other settings, or a number cannot have been saved.
     pub fn load_weights(&mut self, weights: &Weights) -> Result<()> {
         self.networks.load(weights, "")?;
         self.reward.iter_mut().try_for_each(|reward| reward.load(weights))?;

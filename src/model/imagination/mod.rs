@@ -89,7 +89,6 @@ pub enum Propagation {
     /// MM, moment matching: particles are drawn from a Gaussian with mean and variance of the ensemble, then resampled at
     /// every time step from a Gaussian with independent components fitted to a candidate's particles.
     #[doc(alias = "MM")]
-    #[doc(alias = "distribution sampling")]
     MomentMatching,
 }
 

@@ -26,8 +26,8 @@ pub struct WorldModelConfig {
     pub reconstruction: f32,
     /// Group lasso on the encoder's inputs, except differences, such as the vector from the hand to a goal: each step shortens
     /// the weights that leave an input, as one vector, by `learning_rate * lasso`. See
-    /// [`EnsembleConfig::reward_lasso`](crate::model::EnsembleConfig::reward_lasso). Nor are latent states asked to reconstruct
-    /// these inputs: a probe that has no effect on them reads the inputs out of them as well as it can.
+    /// [`EnsembleConfig::reward_lasso`](crate::model::EnsembleConfig::reward_lasso). The decoder does not
+    /// reconstruct these inputs; a probe does, whose gradient does not reach the latent states.
     #[doc(alias = "group lasso")]
     pub lasso: f32,
     /// Weight of the dynamics loss, [`Categorical::dynamics_kl`](crate::nn::Categorical::dynamics_kl).

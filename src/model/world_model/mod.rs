@@ -1,43 +1,4 @@
-//! The world model of DreamerV3 (Hafner et al. 2023): an encoder, an [`Rssm`], and heads that predict from its latent state
-//! the observation (decoder), the reward, and whether the episode continues.
-//!
-//! ```
-//! use handful::env::{Env, Task};
-//! use handful::model::{RssmConfig, WorldModel, WorldModelConfig};
-//! use handful::nn::{Adam, AdamConfig, tensor};
-//! use handful::replay::{SequenceReplay, Transition};
-//! use handful::rng;
-//!
-//! // Thirty steps of a pendulum on which nobody acts.
-//! let mut env = Task::Pendulum.make();
-//! let mut replay = SequenceReplay::new(3, 1, 1000);
-//! let mut obs = env.reset(0);
-//! for i in 0..30 {
-//!     let step = env.step(&[0.0])?;
-//!     let next_obs = step.observation.clone();
-//!     let truncated = i == 29;
-//!     replay.push(&Transition {
-//!         obs, action: vec![0.0], reward: step.reward, next_obs: next_obs.clone(), terminated: false, truncated,
-//!     });
-//!     obs = next_obs;
-//! }
-//!
-//! let mut rng = rng::stream(0, "example");
-//! let rssm = RssmConfig { deter: 16, blocks: 1, hidden: 16, stoch: 4, classes: 4, unimix: 0.01 };
-//! let config = WorldModelConfig { rssm, units: 16, layers: 1, bins: 41, ..WorldModelConfig::default() };
-//! let mut model = WorldModel::new(env.spec(), &config, &mut rng);
-//! let mut optimiser = Adam::new(AdamConfig::laprop(1e-3));
-//! // Four sequences of eight time steps.
-//! let losses = model.learn(&replay.sample(4, 8, &mut rng), &mut optimiser, &mut rng);
-//! assert_eq!(losses[0].0, "reconstruction");
-//!
-//! // Observe once, imagine one step, and decode the observation that is predicted.
-//! let action = tensor(model.device(), vec![0.0], (1, 1, 1));
-//! let latent = model.observe(&model.initial(1), &action, &obs, &mut rng);
-//! let imagined = model.imagine(&latent, &action, &mut rng);
-//! assert_eq!(model.decode(&imagined.features()).len(), 3);
-//! # Ok::<(), handful::error::Error>(())
-//! ```
+//! The world model of DreamerV3.
 
 mod config;
 mod loss;
@@ -65,6 +26,47 @@ const PARTICLES: usize = 8;
 const CONTEXT: usize = 16;
 
 /// Encoder, RSSM, decoder, reward head and continuation head.
+///
+/// The world model of DreamerV3 (Hafner et al. 2023): an encoder, an [`Rssm`], and heads that predict from its latent state
+/// the observation (decoder), the reward, and whether the episode continues.
+///
+/// ```
+/// use handful::env::{Env, Task};
+/// use handful::model::{RssmConfig, WorldModel, WorldModelConfig};
+/// use handful::nn::{Adam, AdamConfig, tensor};
+/// use handful::replay::{SequenceReplay, Transition};
+/// use handful::rng;
+///
+/// // Thirty steps of a pendulum on which nobody acts.
+/// let mut env = Task::Pendulum.make();
+/// let mut replay = SequenceReplay::new(3, 1, 1000);
+/// let mut obs = env.reset(0);
+/// for i in 0..30 {
+///     let step = env.step(&[0.0])?;
+///     let next_obs = step.observation.clone();
+///     let truncated = i == 29;
+///     replay.push(&Transition {
+///         obs, action: vec![0.0], reward: step.reward, next_obs: next_obs.clone(), terminated: false, truncated,
+///     });
+///     obs = next_obs;
+/// }
+///
+/// let mut rng = rng::stream(0, "example");
+/// let rssm = RssmConfig { deter: 16, blocks: 1, hidden: 16, stoch: 4, classes: 4, unimix: 0.01 };
+/// let config = WorldModelConfig { rssm, units: 16, layers: 1, bins: 41, ..WorldModelConfig::default() };
+/// let mut model = WorldModel::new(env.spec(), &config, &mut rng);
+/// let mut optimiser = Adam::new(AdamConfig::laprop(1e-3));
+/// // Four sequences of eight time steps.
+/// let losses = model.learn(&replay.sample(4, 8, &mut rng), &mut optimiser, &mut rng);
+/// assert_eq!(losses[0].0, "reconstruction");
+///
+/// // Observe once, imagine one step, and decode the observation that is predicted.
+/// let action = tensor(model.device(), vec![0.0], (1, 1, 1));
+/// let latent = model.observe(&model.initial(1), &action, &obs, &mut rng);
+/// let imagined = model.imagine(&latent, &action, &mut rng);
+/// assert_eq!(model.decode(&imagined.features()).len(), 3);
+/// # Ok::<(), handful::error::Error>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct WorldModel {
     config: WorldModelConfig,

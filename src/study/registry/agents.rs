@@ -31,7 +31,8 @@ impl AgentContext<'_> {
         (self.env.make)(self.options)
     }
 
-    /// The environment's reward, if it is known as a function of observations.
+    /// The reward that methods are told, if it is known as a function of observations: `planning_reward`, where the options set
+    /// one (the environment then pays another).
     ///
     /// # Errors
     /// If the environment cannot be made.

@@ -51,6 +51,7 @@ fn probability_of_winning<T: Copy>(
     wins: impl Fn(&T, &T) -> bool,
     rng: &mut Rng,
 ) -> (f64, [f64; 2]) {
+    assert!(!first.is_empty() && !second.is_empty(), "runs of both");
     let share = |first: &[T], second: &[T]| {
         let score = |a: &T, b: &T| (1.0 + f64::from(wins(a, b)) - f64::from(wins(b, a))) / 2.0;
         let won = |a: &T| second.iter().map(|b| score(a, b)).sum::<f64>();

@@ -116,6 +116,7 @@ fn resample<'a, T>(values: &'a [T], rng: &mut Rng) -> impl Iterator<Item = &'a T
 #[doc(alias = "confidence interval")]
 #[doc(alias = "resampling")]
 pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rng) -> [f64; 2] {
+    assert!(!values.is_empty(), "values to resample");
     percentiles(|| statistic(&resample(values, rng).copied().collect::<Vec<f64>>()))
 }
 
@@ -128,11 +129,13 @@ pub fn bootstrap(values: &[f64], statistic: impl Fn(&[f64]) -> f64, rng: &mut Rn
 /// companion. With one seed it says nothing about other seeds.
 ///
 /// # Panics
-/// If a task has no seeds or a seed no episodes.
+/// If there is no task, a task has no seeds, or a seed no episodes.
 #[doc(alias = "hierarchical bootstrap")]
 #[doc(alias = "stratified bootstrap")]
 #[doc(alias = "confidence interval")]
 pub fn two_level_bootstrap(tasks: &[&[Vec<f64>]], rng: &mut Rng) -> [f64; 2] {
+    let complete = |seeds: &&[Vec<f64>]| !seeds.is_empty() && seeds.iter().all(|episodes| !episodes.is_empty());
+    assert!(!tasks.is_empty() && tasks.iter().all(complete), "tasks with seeds, and seeds with episodes");
     percentiles(|| {
         let mut of_tasks = 0.0;
         for seeds in tasks {
@@ -216,6 +219,7 @@ fn squared_error(values: &[f64]) -> f64 {
 #[doc(alias = "pigeonhole bootstrap")]
 pub fn paired_difference(first: &[Vec<f64>], second: &[Vec<f64>], rng: &mut Rng) -> (f64, [f64; 2]) {
     let starts = first.iter().chain(second).map(Vec::len).min().unwrap_or(0);
+    assert!(!first.is_empty() && !second.is_empty() && starts > 0, "seeds with starts in common");
     let all: Vec<usize> = (0..starts).collect();
     let mean_of = |seeds: &[&Vec<f64>], starts: &[&usize]| {
         let sum: f64 = seeds.iter().map(|seed| starts.iter().map(|start| seed[**start]).sum::<f64>()).sum();
@@ -305,6 +309,7 @@ pub fn restricted_mean(times: &[Option<f64>], budget: f64) -> f64 {
 /// If one has no runs.
 #[doc(alias = "sample efficiency")]
 pub fn ratio_of_means(first: &[f64], second: &[f64], rng: &mut Rng) -> (f64, [f64; 2]) {
+    assert!(!first.is_empty() && !second.is_empty(), "runs of both");
     let interval = percentiles(|| {
         let drawn: f64 = resample(first, rng).sum();
         drawn / first.len() as f64 / (resample(second, rng).sum::<f64>() / second.len() as f64)
