@@ -184,7 +184,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let median = |of: &dyn Fn(&Row) -> f64| {
             let mut column: Vec<f64> = rows.iter().filter(|row| row.model == model).map(of).collect();
             column.sort_by(f64::total_cmp);
-            column[column.len() / 2] * 1e3
+            (column[(column.len() - 1) / 2] + column[column.len() / 2]) / 2.0 * 1e3
         };
         println!(
             "{model:13} median: itself {:.1} mm, others {:.1} mm",

@@ -1,5 +1,5 @@
 //! A world of one's own, from nothing to a report: a puck, pushed by a force, slides past a post to a goal.
-//! `cargo run --example own_world` compares all agents on it; `... -- train --task puck --method sac` trains one.
+//! `cargo run --example own_world -- study --out runs/puck` compares agents on it; `... -- train --task puck --method sac` trains one.
 
 use handful::env::{arm::Pose, arm::Primitive, scene::Body};
 use handful::{prelude::*, rng};

@@ -113,7 +113,9 @@ pub enum Error {
         source: std::io::Error,
     },
     /// Training that ended in NaN: what was saved before is still there.
-    #[error("{what} is NaN at step {step}: training has diverged; try smaller learning rates")]
+    #[error(
+        "{what} is NaN at step {step}: training has diverged; train again with a smaller learning rate, in another folder"
+    )]
     Diverged {
         /// The loss, or the array of weights.
         what: String,

@@ -36,9 +36,9 @@ enum Press {
     Check,
     /// Format the cells of all chapters
     Format,
-    /// Run all tests under other seeds, and write how many of them hold into the book (hours)
+    /// Run all tests under other seeds, and write into the book how many of them hold (hours)
     Census {
-        /// Under how many
+        /// Number of other seeds
         #[arg(long, default_value_t = 20)]
         shakes: u16,
         /// Only programs and tests whose name contains one of these (such as chapter_05); the other rows stay
@@ -116,7 +116,8 @@ fn build(root: &Path) -> Result<()> {
 
 fn serve(root: &Path, address: &str) -> Result<()> {
     build(root)?;
-    let server = tiny_http::Server::http(address).map_err(|error| anyhow::anyhow!("{address}: {error}"))?;
+    let server = tiny_http::Server::http(address)
+        .map_err(|error| anyhow::anyhow!("{address}: {error}; choose another --address"))?;
     println!("reading at http://{address} (Ctrl-C ends)");
     let mut made = SystemTime::now();
     loop {
@@ -157,9 +158,11 @@ fn serve(root: &Path, address: &str) -> Result<()> {
 /// When a chapter, a notebook or a file of `book/` was last written.
 fn newest(root: &Path) -> Result<SystemTime> {
     let mut newest = SystemTime::UNIX_EPOCH;
-    for folder in ["chapters", "notebooks", "book"] {
+    for folder in ["chapters", "chapters/notes", "notebooks", "book"] {
         for entry in fs::read_dir(root.join(folder))? {
-            newest = newest.max(entry?.metadata()?.modified()?);
+            // An editor's temporary file may be gone again.
+            let written = entry?.metadata().and_then(|there| there.modified());
+            newest = newest.max(written.unwrap_or(SystemTime::UNIX_EPOCH));
         }
     }
     Ok(newest)

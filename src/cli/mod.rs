@@ -47,7 +47,7 @@ enum Command {
     Evaluate(evaluate::Args),
     /// Write a run's settings and weights (matrices in half precision) to a folder to share.
     Export(export::Args),
-    /// Make tables, figures and report.md anew from a study's CSV files.
+    /// Write figures, summary.csv, report.md and report.html again from a study's CSV files.
     Report(report::Args),
     /// Write an episode as one HTML file with a 3D replay.
     Watch(watch::Args),
@@ -57,8 +57,9 @@ enum Command {
 fn note_other_shake(config: &RunConfig) {
     if config.shake != shake() {
         note(format_args!(
-            "this run was made with HANDFUL_SHAKE={}: without it, seeds have other starts",
-            config.shake
+            "this run was made with HANDFUL_SHAKE={}, which is {} now, so the starts are not those of the run",
+            config.shake,
+            shake()
         ));
     }
 }
@@ -118,7 +119,7 @@ fn begin_threads() -> Result<()> {
 /// A number on the command line.
 fn whole<T: FromStr>(text: &str) -> Result<T, &'static str> {
     let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
-    text.parse().map_err(|_| if digits { "it is too large" } else { "give a whole number from 0 on" })
+    text.parse().map_err(|_| if digits { "it is too large" } else { "give a whole number, 0 or more" })
 }
 
 /// Says that the run in a folder has not ended, so that its weights may not be those that it will end with.

@@ -11,10 +11,10 @@ use crate::{files, study::report};
 
 #[derive(clap::Args)]
 pub(super) struct Args {
-    /// A study's folder; given several times, their runs are joined in --out
+    /// A study's folder; given several times, the runs are joined in another folder, --out
     #[arg(long, default_value = "runs/quick")]
     from: Vec<PathBuf>,
-    /// Where to write report and figures; the same folder if left out
+    /// Where to write report and figures [default: the study's folder]
     #[arg(long)]
     out: Option<PathBuf>,
 }

@@ -32,19 +32,20 @@ pub(super) struct Args {
     /// Methods, separated by commas [default: those of the profile]
     #[arg(long, value_delimiter = ',')]
     methods: Option<Vec<String>>,
-    /// How many seeds, or a range like 0..5 [default: 2, in the full profile 5]
+    /// How many seeds, or a range like 0..5 (without 5); methods that do not learn have the first one only [default: 2, in the full
+    /// profile 5]
     #[arg(long, value_parser = seed_range, allow_negative_numbers = true)]
     seeds: Option<Range<u64>>,
-    /// Initial states of evaluations and test: test, or development for tuning
+    /// Initial states of evaluations and test: test, or development for tuning [default: test]
     #[arg(long)]
     starts: Option<Starts>,
-    /// Runs at a time; as many as there are cores if left out
+    /// Runs at a time [default: as many as there are cores]
     #[arg(long, value_parser = at_least_one, allow_negative_numbers = true)]
     jobs: Option<usize>,
     /// Where to write everything [default: runs/PROFILE]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Run nothing; print how far the runs are, also while another process works on them
+    /// Only print the progress of the runs, which another process may be carrying out
     #[arg(long)]
     status: bool,
 }
@@ -200,8 +201,8 @@ fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path, s
     let others = other_complete_runs(folder, runs).len();
     if others > 0 {
         note(format_args!(
-            "{}: {others} other complete run{} not asked for, so the tables are without; to include all, name all tasks, methods \
-             and seeds",
+            "{}: {others} other complete run{} not asked for, so the tables leave them out; to include them, name all tasks, \
+             methods and seeds",
             folder.display(),
             if others == 1 { " is there that was" } else { "s are there that were" }
         ));

@@ -21,10 +21,10 @@ pub(super) struct Args {
     /// A task, for a policy that needs no training
     #[arg(long)]
     task: Option<String>,
-    /// That policy: scripted, random, oracle, or another that does not learn
+    /// The policy: scripted, random, oracle, or another that does not learn
     #[arg(long, default_value = "scripted", conflicts_with = "run")]
     policy: String,
-    /// The seed of the initial state: the first that `evaluate --seed` meets with it
+    /// Seed of the initial state, which is the first one of `evaluate --seed`
     #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
     /// The file [default: watch.html in the run's folder, or TASK-POLICY.html]
@@ -52,8 +52,11 @@ fn without_training(registry: &Registry, task: &str, policy: &str, seed: u64) ->
 }
 
 /// # Errors
-/// If there is a file that is no replay, which would be lost, or cannot be read.
+/// If there is a folder, or a file that is no replay, which would be lost, or cannot be read.
 fn refuse_other_file(path: &Path) -> Result<()> {
+    if path.is_dir() {
+        return Err(Error::Config(format!("{}: this is a folder; give --out the name of a file", path.display())));
+    }
     let mut begins = Vec::new();
     if path.is_file() {
         let read = File::open(path).and_then(|file| file.take(9).read_to_end(&mut begins));

@@ -150,7 +150,15 @@ impl Completed {
     fn read(folder: &Path) -> Result<Self> {
         let path = folder.join(SUMMARY);
         let text = std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
-        toml::from_str(&text).map_err(|problem: toml::de::Error| Error::data(&path)(problem.message().to_string()))
+        let bad =
+            |problem: &str| Error::data(&path)(format!("{problem}; restore the file, or carry the run out again"));
+        let run: Self = toml::from_str(&text).map_err(|problem: toml::de::Error| bad(problem.message()))?;
+        let Summary { success, return_mean, .. } = run.summary;
+        if success.is_finite() && return_mean.is_finite() {
+            Ok(run)
+        } else {
+            Err(bad("a mean of the test is not finite"))
+        }
     }
 
     /// The first file, of those with this ending, that is not what it was when the run ended.

@@ -283,6 +283,31 @@ fn another_recording_of_the_same_name_is_recorded_anew() {
     }
 }
 
+/// It stands in no table, and no checksum covers it.
+#[test]
+fn a_damaged_summary_is_named_and_gives_no_recording() {
+    use handful::prelude::*;
+    use handful::study::config::RunConfig;
+    use handful::study::run::{Event, read_summary};
+    let registry = Registry::standard();
+    let root = tempfile::tempdir().expect("a folder");
+    let runs = [0, 1].map(|seed| {
+        let config = registry.config("pendulum", "random", seed, None, None).expect("a preset");
+        let (config, folder) = (RunConfig { test_episodes: 2, ..config }, root.path().join(format!("seed{seed}")));
+        let mut open = registry.open_run(&config, &folder).expect("a run");
+        while !matches!(open.step().expect("a healthy run"), Event::Tested(_)) {}
+        let file = folder.join("summary.toml");
+        let text = fs::read_to_string(&file).expect("a summary");
+        let mean = text.lines().find(|line| line.starts_with("return_mean")).expect("a mean");
+        fs::write(&file, text.replace(mean, "return_mean = nan")).expect("a writable folder");
+        let problem = read_summary(&folder).expect_err("a mean that is no number").to_string();
+        assert!(problem.contains("summary.toml") && problem.contains("not finite"), "{problem}");
+        (config, folder)
+    });
+    replays::record(&registry, &runs, root.path(), &AtomicBool::new(false)).expect("a writable folder");
+    assert!(!root.path().join("replays/pendulum-random-median.json.gz").exists());
+}
+
 /// What the program says about folders that are none, and about what a report is without.
 #[cfg(feature = "cli")]
 #[test]

@@ -111,11 +111,11 @@ fn tuning_note(tables: &Tables) -> Result<&'static str> {
 
 /// What all methods have in common, and what some know that the others do not.
 fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
-    let (mut told, mut unknown) = (BTreeSet::new(), BTreeSet::new());
+    let (mut told, mut unknown, mut uninformed) = (BTreeSet::new(), BTreeSet::new(), false);
     for (task, method) in pairs {
         match tables.is_told_the_reward(task, method)? {
             Some(true) => _ = told.insert(format!("`{method}`")),
-            Some(false) => {}
+            Some(false) => uninformed |= tables.value(task, method, "steps")?.is_some(),
             None => _ = unknown.insert(format!("`{method}`")),
         }
     }
@@ -130,8 +130,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
     text += if configured { "; settings, from its `runs.csv`, are listed at the end.\n" } else { ".\n" };
     if !told.is_empty() {
         text += &format!(
-            "\nThe methods are not given the same information: {} {} given a reward function{}{}. The other learning methods have only \
-             the rewards that they receive.\n",
+            "\nThe methods are not given the same information: {} {} given a reward function{}{}.{}\n",
             listed(&told),
             if told.len() == 1 { "is" } else { "are" },
             if told.iter().any(|method| method == "`oracle`") {
@@ -140,6 +139,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
                 ""
             },
             if unknown.is_empty() { String::new() } else { format!("; for {}, this is not known", listed(&unknown)) },
+            if uninformed { " The other methods that learn have only the rewards that they receive." } else { "" },
         );
     }
     for difference in tables.differences_of_environments()? {

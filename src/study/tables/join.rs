@@ -115,7 +115,8 @@ fn same_columns<'a>(tables: impl Iterator<Item = (&'a DataFrame, &'a PathBuf)>) 
     let Some((first, folder)) = tables.next() else { return Ok(()) };
     match tables.find(|(table, _)| table.get_column_names() != first.get_column_names()) {
         Some((_, other)) => Err(Error::Config(format!(
-            "the tables in {} and {} do not have the same columns: they come from versions that cannot be joined",
+            "the tables in {} and {} do not have the same columns: they come from versions that cannot be joined; \
+             run one of them again with this version",
             folder.display(),
             other.display()
         ))),

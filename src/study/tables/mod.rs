@@ -299,5 +299,8 @@ impl Tables {
 /// An error in tables that could be read.
 fn inside(problem: PolarsError) -> Error {
     let problem = problem.to_string();
-    Error::Config(format!("the tables of the study are inconsistent: {}", problem.lines().next().unwrap_or_default()))
+    Error::Config(format!(
+        "the tables of the study are inconsistent ({}); restore them, or run its command again",
+        problem.lines().next().unwrap_or_default()
+    ))
 }

@@ -138,13 +138,16 @@ pub(super) const RUNS: TableFormat = TableFormat {
 pub(super) const LEFT_OUT: TableFormat =
     TableFormat { columns: &[("run", Cell::Text, Always), ("reason", Cell::Text, Always)], order: &[], counts: false };
 
+/// What to do about a table that is damaged.
+const REMEDY: &str = "; restore the table, or run the command that made it again";
+
 /// The table of a run.
 ///
 /// # Errors
 /// If it cannot be read, is empty, lacks a column, or a row cannot be true.
 pub(super) fn of_run(path: &Path, format: &TableFormat) -> Result<DataFrame> {
     let table = read(path, format, &[])?;
-    if table.width() == 0 { Err(Error::data(path)("the table is empty")) } else { Ok(table) }
+    if table.width() == 0 { Err(Error::data(path)(format!("the table is empty{REMEDY}"))) } else { Ok(table) }
 }
 
 /// The table of a study. It has no columns if the file is empty: no run had anything to write there.
@@ -177,9 +180,9 @@ fn read(path: &Path, format: &TableFormat, labels: &[(&'static str, Cell, Need)]
             (None, _) if need == Optional => {}
             (None, _) => {
                 let there = excerpt(&header.iter().collect::<Vec<_>>().join(","));
-                return Err(bad(format!("the table has no column `{name}`, but: {there}")));
+                return Err(bad(format!("the table has no column `{name}`, but: {there}{REMEDY}")));
             }
-            (Some(_), Some(_)) => return Err(bad(format!("the table has two columns `{name}`"))),
+            (Some(_), Some(_)) => return Err(bad(format!("the table has two columns `{name}`{REMEDY}"))),
         }
     }
     let mut last: HashMap<Vec<String>, Vec<u64>> = HashMap::new();
@@ -204,7 +207,7 @@ fn read(path: &Path, format: &TableFormat, labels: &[(&'static str, Cell, Need)]
             };
             let before = if before.is_empty() { "nothing".into() } else { place(&before) };
             let problem = format!(
-                "line {line}: {} of a run comes after {before}: a row is doubled, missing or moved",
+                "line {line}: {} of a run comes after {before}: a row is doubled, missing or moved{REMEDY}",
                 place(&here)
             );
             return Err(bad(problem));
@@ -219,7 +222,7 @@ fn in_short(problem: &csv::Error) -> String {
     let line = problem.position().map_or(0, csv::Position::line);
     match problem.kind() {
         csv::ErrorKind::UnequalLengths { expected_len, len, .. } => {
-            format!("line {line}: it has {len} cells, the header has {expected_len}")
+            format!("line {line}: it has {len} cells, the header has {expected_len}{REMEDY}")
         }
         csv::ErrorKind::Utf8 { .. } => format!("line {line}: it is not text in UTF-8"),
         _ => format!("not a table ({problem})"),
