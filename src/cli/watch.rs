@@ -24,7 +24,7 @@ pub(super) struct Args {
     /// The policy: scripted, random, oracle, or another that does not learn
     #[arg(long, default_value = "scripted", conflicts_with = "run")]
     policy: String,
-    /// Seed of the initial state, which is the first one of `evaluate --seed`
+    /// Seed: the episode starts as the first one of `evaluate --seed` with it
     #[arg(long, default_value_t = 0, value_parser = whole::<u64>, allow_negative_numbers = true)]
     seed: u64,
     /// The file [default: watch.html in the run's folder, or TASK-POLICY.html]
@@ -52,7 +52,7 @@ fn without_training(registry: &Registry, task: &str, policy: &str, seed: u64) ->
 }
 
 /// # Errors
-/// If there is a folder, or a file that is no replay, which would be lost, or cannot be read.
+/// If the path is a folder, or a file that is not a replay (it would be lost) or cannot be read.
 fn refuse_other_file(path: &Path) -> Result<()> {
     if path.is_dir() {
         return Err(Error::Config(format!("{}: this is a folder; give --out the name of a file", path.display())));

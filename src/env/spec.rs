@@ -67,8 +67,8 @@ pub enum Role {
     #[default]
     Dynamic,
     /// It is constant throughout an episode, as a goal is. The dynamics of an ensemble neither predict it nor read it, nor a difference
-    /// that contains it: a quantity on which the motion depends (a mass, a friction) is [`Role::Dynamic`]. SAC, latent models and
-    /// learned rewards do read it.
+    /// that contains it: a quantity on which the motion depends (a mass, a friction) is [`Role::Dynamic`]. SAC reads it, and so do
+    /// latent models and learned rewards, unless it is the minuend of a difference.
     Constant,
     /// It is the difference `minuend - subtrahend` of two other features, and computed from them.
     Difference {

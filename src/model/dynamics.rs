@@ -32,7 +32,7 @@ pub struct Dynamics {
 /// `aleatoric + epistemic` is the total variance of the mixture of all members.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
-    /// Mean of the next observation: the mean of the members' means.
+    /// Mean of each predicted feature of the next observation: the mean of the members' means.
     pub mean: Vec<f64>,
     /// Aleatoric variance (noise of the environment): the mean of the members' variances.
     pub aleatoric: Vec<f64>,

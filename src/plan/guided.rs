@@ -63,8 +63,6 @@ require elites <= population => "`elites` must not exceed `population`";
 require min_deviation <= max_deviation => "`min_deviation` must not exceed `max_deviation`";
 );
 
-/// MPPI over elites, guided by proposals: the planner of TD-MPC2.
-///
 /// The planner of TD-MPC2 (Hansen et al. 2024, section 3.2): MPPI over the best candidates, whose deviation adapts, guided by
 /// sequences that the objective proposes, such as those of a learned policy.
 ///

@@ -29,9 +29,7 @@ impl Default for HybridConfig {
 
 ranges!(HybridConfig { icem: Nested, iterations: 1..=10_000, rate: 1e-6..=10.0 });
 
-/// iCEM, refined by gradient ascent.
-///
-/// iCEM searches globally, a few steps of gradient ascent refine its plan,
+/// iCEM, refined by gradient ascent: iCEM searches globally, a few steps of gradient ascent refine its plan,
 /// and the refined plan is kept only if it is better when both are evaluated again, side by side. (In the spirit of
 /// Bharadhwaj et al. 2020, who take gradient steps on the samples of every CEM iteration.)
 #[derive(Clone, Debug)]

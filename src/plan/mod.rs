@@ -109,9 +109,8 @@ pub trait Objective {
     fn returns(&mut self, sequences: &ActionSequences) -> Vec<f32>;
 
     /// Returns, `[count]`, and their gradients with respect to the actions, `[count, horizon, actions]`. The default takes
-    /// central differences, at the price of two more returns for each number; a differentiable objective overrides it. They
-    /// are taken 0.001 to either side, also beyond the bounds. It may differentiate an approximation: planners compare sequences by
-    /// `returns`.
+    /// central differences (0.001 to either side, also beyond the bounds), at the price of two more returns for each number. A
+    /// differentiable objective overrides it, and may differentiate an approximation: planners compare sequences by `returns`.
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         const STEP: f32 = 1e-3;
         let width = sequences.width();

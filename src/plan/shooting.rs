@@ -24,9 +24,8 @@ impl Default for ShootingConfig {
 
 ranges!(ShootingConfig { horizon: 2..=1000, population: 1..=1_000_000 });
 
-/// Random shooting: the best of many uniform random sequences (as in Nagabandi et al. 2018, section IV.C).
-///
-/// Random shooting: the baseline of planners. It keeps nothing from one plan to the next.
+/// Random shooting: the best of many uniform random sequences (as in Nagabandi et al. 2018, section IV.C), the baseline of planners. It
+/// keeps nothing from one plan to the next.
 #[doc(alias = "random shooting")]
 #[derive(Clone, Debug)]
 pub struct RandomShooting {

@@ -149,7 +149,7 @@ impl ReplayBuffer {
         self.pushed += 1;
     }
 
-    /// Ends the episode after the last transition, because a decision that the time limit cut short is left out.
+    /// Ends the episode after the last transition: it was given up, or a decision that the time limit cut short is left out.
     pub(crate) fn close(&mut self) {
         let (last, width) = ((self.pushed.max(1) - 1) % self.capacity as u64, self.width());
         if let Some(end) = self.rows.get_mut((last as usize + 1) * width - 1)
@@ -212,7 +212,7 @@ impl ReplayBuffer {
     }
 
     /// The index of the transition after the one at index `i`, if it belongs to the same episode: if that did not end, and it starts
-    /// from the observation at which the other ended (it does not, where an episode was given up before its end).
+    /// from the observation at which the other ended.
     fn successor(&self, i: usize) -> Option<usize> {
         let next = (i + 1) % self.capacity;
         // After the newest comes the oldest, or nothing.

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use super::folder::{CHECKPOINT, CONFIG, SUMMARY, WEIGHTS, check_run, is_open, read_config, read_weights};
+use super::completed::SUMMARY;
+use super::folder::{CHECKPOINT, CONFIG, WEIGHTS, check_run, is_open, read_config, read_weights};
 use crate::checkpoint::Weights;
 use crate::error::{Error, Result};
 use crate::files;

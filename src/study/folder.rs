@@ -1,13 +1,11 @@
 //! A run's folder: who may write in it, whose run it holds, and what a resumed run starts from.
 
-use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
+use super::completed::{Completed, SUMMARY, checksum};
 use super::config::{RunConfig, bad_config};
 use super::evaluate::Summary;
 use super::records::{Progress, TABLES, write_test};
@@ -21,7 +19,6 @@ use crate::files;
 pub(super) const CONFIG: &str = "config.toml";
 pub(super) const CHECKPOINT: &str = "checkpoint/state.safetensors";
 pub(super) const WEIGHTS: &str = "weights.safetensors";
-pub(super) const SUMMARY: &str = "summary.toml";
 pub(super) const LOCK: &str = ".lock";
 
 /// The note in a checkpoint, and in weights, that holds the run's configuration.
@@ -131,46 +128,6 @@ impl RunFolder {
         let completed = toml::to_string(&completed).expect("a summary is TOML");
         files::write(&self.path.join(SUMMARY), completed.as_bytes())
     }
-}
-
-/// What a run's `summary.toml` holds.
-#[derive(Serialize, Deserialize)]
-struct Completed {
-    /// The versions of the program that made it; earlier ones did not say.
-    #[serde(default)]
-    version: String,
-    #[serde(flatten)]
-    summary: Summary,
-    /// CRC-32 of each other file that it ended with; the first edition wrote none.
-    #[serde(default)]
-    checksums: BTreeMap<String, u32>,
-}
-
-impl Completed {
-    fn read(folder: &Path) -> Result<Self> {
-        let path = folder.join(SUMMARY);
-        let text = std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
-        let bad =
-            |problem: &str| Error::data(&path)(format!("{problem}; restore the file, or carry the run out again"));
-        let run: Self = toml::from_str(&text).map_err(|problem: toml::de::Error| bad(problem.message()))?;
-        let Summary { success, return_mean, .. } = run.summary;
-        if success.is_finite() && return_mean.is_finite() {
-            Ok(run)
-        } else {
-            Err(bad("a mean of the test is not finite"))
-        }
-    }
-
-    /// The first file, of those with this ending, that is not what it was when the run ended.
-    fn changed(&self, folder: &Path, ending: &str) -> Option<PathBuf> {
-        let files = self.checksums.iter().filter(|(file, _)| file.ends_with(ending));
-        let mut files = files.map(|(file, checksum)| (folder.join(file), checksum));
-        files.find_map(|(path, expected)| (checksum(&path).ok() != Some(*expected)).then_some(path))
-    }
-}
-
-fn checksum(path: &Path) -> Result<u32> {
-    Ok(crc32fast::hash(&std::fs::read(path).map_err(Error::io("read", path))?))
 }
 
 /// # Errors

@@ -30,6 +30,7 @@
 //! # Ok::<(), Error>(())
 //! ```
 
+mod completed;
 pub mod config;
 pub mod evaluate;
 mod export;

@@ -303,10 +303,7 @@ fn chosen(runs: &[(RunConfig, PathBuf)]) -> Vec<(Replay, &Path)> {
     let mut episodes = Vec::new();
     for mut seeds in methods {
         let middle = (seeds.len() - 1) / 2;
-        seeds.sort_by(|a, b| {
-            let [success, total] = [0, 1].map(|i| a.quality[i].total_cmp(&b.quality[i]));
-            success.then(total)
-        });
+        seeds.sort_by(|a, b| a.quality.partial_cmp(&b.quality).expect("means of a complete run are finite"));
         let Tested { config, folder, results, .. } = seeds.swap_remove(middle);
         let mut order: Vec<usize> = (0..results.len()).collect();
         order.sort_by(|&a, &b| results[a].total.total_cmp(&results[b].total));

@@ -198,7 +198,7 @@ pub fn carry_out(
 ///
 /// # Errors
 /// [`Error::Run`] for the first run that failed so, when the others are complete. Any other error of a run, such as a full disk; `stop`
-/// is then set, as by a caller who wants all runs to end with their episode and be saved, and so it stays.
+/// is then set, and stays set: the other runs end with their episode and are saved.
 pub fn carry_out_all(
     registry: &Registry,
     runs: &[(RunConfig, PathBuf)],

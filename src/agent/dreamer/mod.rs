@@ -6,8 +6,8 @@
 //! [`crate::plan`], one update in `update.rs`. Losses, networks and constants are those of the published code, in its newest
 //! version. Deviations: there is one environment, the first actions are random (`warm_up`), the replay buffer is smaller, its
 //! sequences start with a latent state of zeros, new experience has no precedence in it, positions are seen as differences
-//! ([`LatentFeatures`](crate::model::LatentFeatures)), and in evaluation the policy acts by its mean. Optional: rollouts from a part of the states
-//! (`dreams`), decisions of several time steps, updates owed for the warm-up, exploration with coloured noise, an actor gradient through
+//! ([`LatentFeatures`](crate::model::LatentFeatures)), and in evaluation the policy acts by its mean. Optional: rollouts from a part of
+//! the states (`dreams`), decisions of several time steps, updates owed for the warm-up, exploration with coloured noise, an actor gradient through
 //! the dynamics, centred advantages, a penalty on the mean action, an entropy coefficient tuned towards a target entropy, a group lasso
 //! on the encoder's inputs, with a probe that reconstructs what it prunes. PlaNet has Gaussian states, the KL divergence in its loss
 //! once, no critic at the end of a plan, and Gaussian noise on planned actions while it collects experience; here plans are executed

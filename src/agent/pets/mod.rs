@@ -48,7 +48,7 @@ const SHOWN: usize = 8;
 ///         record the transition                                        Pets::observe
 /// ```
 ///
-/// This module wires them together: the ensemble and its imagination are in [`crate::model`], the search is in
+/// This type wires them together: the ensemble and its imagination are in [`crate::model`], the search is in
 /// [`crate::plan`].
 ///
 /// Deviations: the default planner is iCEM; fits come every `fit_every` time steps rather than after each episode; the random
@@ -166,8 +166,8 @@ impl Pets {
     }
 
     /// Fits the model to the replay buffer, and plans in it from the next action on. Returns `model_loss` (the mean training
-    /// loss, comparable only between ensembles with the same `beta`), `model_steps` (gradient steps) and `model_error` (the mean squared error on
-    /// held-out transitions, in normalised units) and, with a learned reward, `reward_error` (the same of its networks).
+    /// loss, comparable only between ensembles with the same `beta`), `model_steps` (gradient steps) and `model_error` (the mean squared
+    /// error on held-out transitions, in normalised units) and, with a learned reward, `reward_error` (the same of its networks).
     ///
     /// # Panics
     /// If fewer than two decisions have been observed.

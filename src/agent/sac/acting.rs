@@ -10,6 +10,7 @@ use crate::rng;
 
 impl Agent for Sac {
     fn begin_episode(&mut self) {
+        self.replay.close();
         self.forget_episode();
         self.slots.clear(0);
     }

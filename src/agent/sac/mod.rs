@@ -1,4 +1,4 @@
-//! Soft actor-critic, the model-free baseline.
+//! Soft actor-critic, the model-free baseline. Equation numbers are those of Haarnoja et al. 2018 (arXiv:1812.05905).
 
 mod acting;
 mod backup;
@@ -33,7 +33,7 @@ use crate::settings::Ranges;
 /// The SAC agent: a policy, its critics and target critics, a temperature, and a replay buffer.
 ///
 /// Soft actor-critic (SAC) with automatic temperature (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and
-/// Applications", arXiv:1812.05905, Algorithm 1; equation numbers below are that paper's). The model-free baseline.
+/// Applications", arXiv:1812.05905, Algorithm 1). The model-free baseline.
 ///
 /// One update: [`Sac::learn`] samples a minibatch from the replay buffer, moves the critics towards the soft Bellman
 /// target, the policy up the critics' values and its entropy, the temperature towards the target entropy, and the target

@@ -45,7 +45,7 @@ const PROBE_RATE: f32 = 1e-3;
 ///     learn latent dynamics, rewards, values and policy from slices       TdMpc2::learn
 /// ```
 ///
-/// The model is in [`crate::model::implicit`], the planner in [`crate::plan`]; an update is in `update.rs`. Deviations: no
+/// The model is in [`crate::model::implicit`], the planner in [`crate::plan`]. Deviations: no
 /// dropout in the first layer of Q; slices are drawn uniformly over their starts, those of the running episode included;
 /// observations enter as [`LatentFeatures`](crate::model::LatentFeatures); NaN is the worst return, not 0; the rewards of a held
 /// action are averaged, not summed; sizes for two cores. Optional: a group lasso on the encoder's inputs, another unit of rewards,

@@ -19,7 +19,8 @@ pub(super) const LIFTED: f64 = 0.04;
 pub(super) const CUBE: usize = GRIPPER.end;
 const HAND_TO_CUBE: usize = CUBE + 12;
 
-/// Grasp the cube and lift its centre to more than 4 cm above the table: robosuite's Lift, with its numbers (but see [`TableTask::horizon`]).
+/// Grasp the cube and lift its centre to more than 4 cm above the table: robosuite's Lift, with its numbers. An
+/// episode is shorter than in its published runs.
 #[derive(Clone, Copy, Debug)]
 pub struct Lift;
 

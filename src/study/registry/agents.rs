@@ -54,7 +54,10 @@ impl AgentContext<'_> {
     fn scripted(&self) -> Result<Method> {
         let make = self.env.scripted.as_ref();
         let make = make.ok_or_else(|| {
-            Error::Unsupported(format!("{} has no scripted policy; take another, such as random", self.env.name))
+            Error::Unsupported(format!(
+                "{} has no scripted policy; take another method or policy, such as random",
+                self.env.name
+            ))
         })?;
         Ok(Method::fixed(make(self.options)?))
     }

@@ -139,7 +139,7 @@ pub(super) const LEFT_OUT: TableFormat =
     TableFormat { columns: &[("run", Cell::Text, Always), ("reason", Cell::Text, Always)], order: &[], counts: false };
 
 /// What to do about a table that is damaged.
-const REMEDY: &str = "; restore the table, or run the command that made it again";
+const REMEDY: &str = "; restore the table, or run again the command that made it";
 
 /// The table of a run.
 ///
