@@ -216,8 +216,16 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     let oracle = success("lift", "lift", "oracle");
     let sparc = lift("oracle", "smoothness_sparc");
     quotes.push(("README.md", format!("| oracle (plans on the true simulator) | {oracle} | - | - | {sparc:.1} |")));
-    let opened = test_successes("door", "door", "oracle")[0];
-    quotes.push(("README.md", format!("the final reward counts 20 times | 3 x 40 | – | {opened} of 100 |")));
+    for (task, plan) in [
+        ("reach", "4 actions, each held 2 steps | 2 x 20 | 45"),
+        ("push", "10 actions, each held 3 steps; the final reward counts 100 times | 4 x 64 | 1,150"),
+        ("lift", "8 knots of a spline, 3 steps apart; the final reward counts 5 times | 3 x 32 | 340"),
+        ("door", "12 knots, 4 steps apart; the final reward counts 20 times | 3 x 40 | 1,100"),
+    ] {
+        let episodes = in_study(task, task, "oracle", "test_episodes");
+        let successes = test_successes(task, task, "oracle")[0];
+        quotes.push(("README.md", format!("| `{task}` | {plan} | {successes} of {episodes} |")));
+    }
     let [pets, learned] = ["pets", "pets-learned"].map(|method| success("lift", "lift", method));
     let dreamer = ["success", "success_low", "success_high"].map(|column| 100.0 * lift("dreamer", column));
     let [dreamer, low, high] = dreamer.map(|rate| format!("{rate:.0}"));
