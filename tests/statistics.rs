@@ -17,7 +17,7 @@ use handful::study::runner::{Budget, Profile, StudyPlan};
 use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
-    Time, area_under_curve, bootstrap, censored_median, interquartile_mean, mean, paired_difference,
+    Time, area_under_curve, bootstrap, censored_median, falls_below_again, interquartile_mean, mean, paired_difference,
     probability_of_being_earlier, probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean,
     steps_to, t_interval, two_level_bootstrap, welch_interval, wilson,
 };
@@ -121,7 +121,10 @@ fn success_curves() {
     assert_eq!(steps_to(0.8, &[0.0, 500.0, 1000.0], &[0.0, 1.0, 1.0]), Some(500.0));
     assert_eq!(steps_to(0.95, &steps, &success), None, "the last evaluation has no next one");
     assert_eq!(steps_to(0.9, &steps, &success), Some(40.0));
-    assert_eq!(steps_to(0.8, &steps, &[0.0, 0.9, 0.5, 0.8, 0.8, 0.1]), Some(30.0), "one high evaluation is not enough");
+    let falling = [0.0, 0.9, 0.5, 0.8, 0.8, 0.1];
+    assert_eq!(steps_to(0.8, &steps, &falling), Some(30.0), "one high evaluation is not enough");
+    assert!(falls_below_again(0.8, &steps, &falling) && !falls_below_again(0.8, &steps, &falling[..5]));
+    assert!(!falls_below_again(0.9, &steps, &falling), "it has not been there");
 }
 
 /// Two methods, five seeds each, thousands of steps, budget 150; the last seed of the first does not get there.

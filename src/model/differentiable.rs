@@ -125,7 +125,7 @@ impl Differentiable {
 
     /// Returns of the action sequences `actions` (`[candidates, horizon, action]`) from `obs`, `[candidates]`, and their
     /// gradients with respect to `actions`, of the same shape. A return is the mean over the members' undiscounted returns
-    /// minus `disagreement_penalty` times their standard deviation.
+    /// minus `disagreement_penalty` times their standard deviation; rewards after a termination count.
     ///
     /// # Panics
     /// If the sizes do not fit together, or `reward` is [`Reward::Learned`] and the model has not learned rewards.

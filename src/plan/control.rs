@@ -112,7 +112,9 @@ pub struct RecedingHorizon {
     config: ControlConfig,
     planner: Box<dyn Planner>,
     action_size: usize,
-    /// What is left to execute of the plan, in control steps.
+    /// The plan that the last call of [`RecedingHorizon::act`] made, in control steps; empty if it made none.
+    plan: Vec<f32>,
+    /// What is left to execute of the last plan, in control steps.
     queue: VecDeque<f32>,
     /// The last executed action; zeros before the first.
     last: Vec<f32>,
@@ -127,12 +129,13 @@ impl RecedingHorizon {
         let ControlConfig { action_repeat, replan_every, .. } = *config;
         assert!(action_repeat > 0 && replan_every > 0, "`action_repeat` and `replan_every` must be at least 1");
         let last = vec![0.0; action_size];
-        Self { config: config.clone(), planner, action_size, queue: VecDeque::new(), last }
+        Self { config: config.clone(), planner, action_size, plan: Vec::new(), queue: VecDeque::new(), last }
     }
 
     /// Forgets everything: a new episode begins.
     pub fn reset(&mut self) {
         self.planner.reset();
+        self.plan.clear();
         self.queue.clear();
         self.last.fill(0.0);
     }
@@ -146,6 +149,7 @@ impl RecedingHorizon {
     #[doc(alias = "MPC")]
     #[doc(alias = "model predictive control")]
     pub fn act(&mut self, objective: &mut dyn Objective, observer: &mut PlanObserver, rng: &mut Rng) -> Vec<f32> {
+        self.plan.clear();
         if self.queue.is_empty() {
             let replan_every = self.config.replan_every;
             let spline = Spline { config: &self.config, start: &self.last };
@@ -157,15 +161,23 @@ impl RecedingHorizon {
             };
             let mut objective = WithCosts { objective, costs: self.config.costs(), before: &self.last };
             let plan = self.planner.plan(&mut Interpolated { objective: &mut objective, spline }, &mut observe, rng);
-            let executed = plan.actions.get(..replan_every * self.action_size).unwrap_or_else(|| {
-                let numbers = plan.actions.len();
-                panic!("`replan_every` is {replan_every}, but the planner's plan has {numbers} numbers only")
-            });
+            let (numbers, executed) = (plan.actions.len(), replan_every * self.action_size);
+            assert!(
+                executed <= numbers,
+                "`replan_every` is {replan_every}, but the planner's plan has {numbers} numbers only"
+            );
             self.planner.shift(replan_every);
-            self.queue.extend(spline.interpolate(executed));
+            self.plan = spline.interpolate(&plan.actions);
+            self.queue.extend(&self.plan[..executed * self.config.action_repeat]);
         }
         self.last = self.queue.drain(..self.action_size).collect();
         self.last.clone()
+    }
+
+    /// The whole plan that the last call of [`RecedingHorizon::act`] made, `[control steps, action]`, of which it executes the first
+    /// actions; empty if it went on with an earlier one.
+    pub fn last_plan(&self) -> &[f32] {
+        &self.plan
     }
 }
 

@@ -168,7 +168,7 @@ impl SequenceReplay {
         /// Attempts before all starts are looked through: most of them lead to a whole subsequence, unless episodes are short.
         const ATTEMPTS: usize = 100;
         let starts = (self.len() + 1).checked_sub(length).filter(|starts| *starts > 0 && length > 0)?;
-        let within = |start: &usize| !(start + 1..start + length).any(|i| self.row(i)[self.width() - 3] > 0.5);
+        let within = |start: &usize| !(start + 1..start + length).any(|i| self.is_first(i));
         let mut all: Option<Vec<usize>> = None;
         let draw = |_| {
             if all.is_none() {
@@ -189,9 +189,14 @@ impl SequenceReplay {
         &self.rows[(self.oldest + i) % self.len() * self.width()..][..self.width()]
     }
 
+    /// Whether an episode begins with the time step at index `i`.
+    fn is_first(&self, i: usize) -> bool {
+        self.row(i)[self.width() - 3] > 0.5
+    }
+
     /// The subsequences that start at these time steps.
     fn at(&self, starts: &[usize], length: usize) -> SequenceBatch {
-        let (count, width) = (self.len(), self.width());
+        let count = self.len();
         let row = |i: usize| self.row(i);
         let mut batch = SequenceBatch { sequences: starts.len(), length, ..SequenceBatch::default() };
         for t in 0..length {
@@ -200,7 +205,7 @@ impl SequenceReplay {
                 let (action, rest) = rest.split_at(self.action_size);
                 let [reward, first, last, terminal] = rest else { unreachable!("four numbers") };
                 // An episode that a crash cut short has no last time step: the one before the next start is its last.
-                let cut = start + t + 1 < count && row(start + t + 1)[width - 3] > 0.5;
+                let cut = start + t + 1 < count && self.is_first(start + t + 1);
                 batch.obs.extend(obs);
                 batch.actions.extend(action);
                 batch.rewards.push(*reward);

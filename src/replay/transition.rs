@@ -150,7 +150,7 @@ impl ReplayBuffer {
     }
 
     /// Ends the episode after the last transition: it was given up, or a decision that the time limit cut short is left out.
-    pub(crate) fn close(&mut self) {
+    pub(crate) fn cut_off(&mut self) {
         let (last, width) = ((self.pushed.max(1) - 1) % self.capacity as u64, self.width());
         if let Some(end) = self.rows.get_mut((last as usize + 1) * width - 1)
             && *end == GOES_ON
@@ -237,20 +237,23 @@ impl ReplayBuffer {
     /// Reads what [`ReplayBuffer::save`] wrote.
     ///
     /// # Errors
-    /// If it is missing, has transitions of other sizes, or more of them than fit.
+    /// If it is missing, has transitions of other sizes or more of them than fit, or was full at a smaller capacity.
     pub fn load(&mut self, weights: &Weights, prefix: &str) -> Result<()> {
         let name = format!("{prefix}.rows");
         let count = fitting(weights, &name, self.capacity)?;
         let rows = weights.get(&name, [1, count, self.width()])?.to_vec();
-        let next = weights.count(&format!("{prefix}.next"), 0..=count as u64)?;
+        let held = count as u64;
+        // Before it is full, a buffer holds all that was added, in order.
+        let full = count == self.capacity;
+        let next = weights.count(&format!("{prefix}.next"), if full { 0..=held } else { held..=held })?;
         let pushed = format!("{prefix}.pushed");
-        self.pushed = if count < self.capacity {
-            count as u64
-        } else if weights.has_counts(&pushed) {
-            weights.count(&pushed, count as u64..=MAX_COUNT)?
+        self.pushed = if weights.has_counts(&pushed) {
+            weights.count(&pushed, held..=if full { MAX_COUNT } else { held })?
+        } else if !full {
+            held
         } else {
             // Older checkpoints do not say how often the ring was filled; any number tells its order.
-            count as u64 + next
+            held + next
         };
         self.rows = rows;
         Ok(())
@@ -303,7 +306,7 @@ mod tests {
             let (obs, next_obs) = (vec![0.0], vec![0.0]);
             buffer.push(&Transition { obs, action: vec![0.0], reward: 1.0, next_obs, terminated: false, truncated });
             if !truncated {
-                buffer.close();
+                buffer.cut_off();
             }
         }
         let batch = buffer.sample_n_step(50, 3, 1.0, &mut rng::stream(0, "one step each"));

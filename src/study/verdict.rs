@@ -187,17 +187,20 @@ pub(super) fn budgets(tables: &Tables, task: &str) -> Result<BTreeMap<u64, Vec<S
 
 /// The methods in the order of their smoothness.
 fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<String>> {
-    let mut known: Vec<(f64, &str)> = Vec::new();
+    let mut known: Vec<(f64, &str, String)> = Vec::new();
     for method in methods {
-        known.extend(tables.value(task, method, "smoothness_sparc")?.map(|sparc| (sparc, method.as_str())));
+        let ldlj = tables.value(task, method, "smoothness_ldlj")?;
+        let ldlj = ldlj.map_or(String::new(), |ldlj| format!(" ({ldlj:.1})"));
+        known.extend(tables.value(task, method, "smoothness_sparc")?.map(|sparc| (sparc, method.as_str(), ldlj)));
     }
     if known.len() < 2 {
         return Ok(None);
     }
     known.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let known: Vec<String> = known.iter().map(|(sparc, method)| format!("`{method}` {sparc:.1}")).collect();
+    let known: Vec<String> = known.iter().map(|(sparc, method, ldlj)| format!("`{method}` {sparc:.2}{ldlj}")).collect();
     Ok(Some(format!(
-        "Smoothness of the hand's path in the test (SPARC, the smoothest first; differences not tested for significance): {}.",
+        "Smoothness of the hand's path in the test (SPARC, the smoothest first, and in brackets the log dimensionless jerk, which may order \
+         the methods differently; differences not tested for significance): {}.",
         known.join(", ")
     )))
 }

@@ -104,6 +104,9 @@ require replay >= length => "`replay` must hold at least `length` decisions";
 require *train_ratio <= (100 * batch * length) as f32 => "`train_ratio` must not exceed 100 times `batch` times `length`";
 require planner.as_ref().is_none_or(|planner| control.suits(planner)) =>
     "`control.replan_every` must not exceed the planner's `horizon`";
+require !matches!(planner, Some(PlannerConfig::Gradient(_) | PlannerConfig::Hybrid(_))) =>
+    "`planner` must not be `gradient` or `hybrid`: every sequence is imagined with random numbers of its own, so differences of returns \
+     are no gradients";
 require planner.as_ref().is_none_or(|planner| {
     fits(&[planner.candidates(), planner.horizon() * control.action_repeat + world.widest()])
 }) => "the planner's candidates do not fit into memory";

@@ -79,4 +79,9 @@ impl Controller {
         };
         self.control.act(&mut objective, observer, &mut self.rng)
     }
+
+    /// The plan behind the last decision, `[decisions, action]`; empty if that went on with an earlier one.
+    pub(super) fn last_plan(&self) -> &[f32] {
+        self.control.last_plan()
+    }
 }

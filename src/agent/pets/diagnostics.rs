@@ -10,7 +10,6 @@ use crate::agent::{Diagnostics, ValueEstimate};
 use crate::model::Imagination;
 use crate::model::open_loop::{OpenLoop, Propagated, WithActionRepeat, open_loop};
 use crate::model::uncertainty::Risk;
-use crate::plan::Iteration;
 use crate::replay::Episode;
 use crate::rng;
 
@@ -46,13 +45,8 @@ fn predictions(mut controller: Controller, model: &PlanningModel, episode: &Epis
     let episode = &in_decisions(episode, model.config.action_repeat);
     let mut estimates = Vec::new();
     for (t, obs) in episode.observations.iter().take(episode.actions.len()).enumerate() {
-        let mut plan = Vec::new();
-        let mut observer = |iteration: &Iteration| {
-            let returns = iteration.returns.iter().enumerate();
-            let best = returns.max_by(|a, b| a.1.total_cmp(b.1)).map_or(0, |(i, _)| i);
-            plan = iteration.candidates.row(best).to_vec();
-        };
-        controller.decide(model, obs, 0.0, &mut observer);
+        controller.decide(model, obs, 0.0, &mut |_| {});
+        let plan = controller.last_plan();
         let horizon = plan.len() / episode.actions[t].len();
         let end = (t + horizon).min(episode.actions.len());
         if horizon == 0 || (end < t + horizon && !episode.terminated) {
@@ -60,8 +54,7 @@ fn predictions(mut controller: Controller, model: &PlanningModel, episode: &Epis
             continue;
         }
         let imagination = Imagination { value: None, ..model.imagination() };
-        let imagined =
-            imagination.imagined_returns(obs, &plan, horizon, &mut rng::stream(t as u64, "pets predictions"));
+        let imagined = imagination.imagined_returns(obs, plan, horizon, &mut rng::stream(t as u64, "pets predictions"));
         let realised = (t..end).map(|t| reward_at(model.reward, episode, t)).sum();
         estimates.push(ValueEstimate { expected: Risk::Neutral.of(&imagined.returns), realised });
     }

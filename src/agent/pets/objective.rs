@@ -29,9 +29,9 @@ impl Objective for EnsembleObjective<'_> {
         scores.map(|(returns, disagreement)| self.risk.of(returns) + self.disagreement * disagreement).collect()
     }
 
-    /// An approximation of the gradient of [`Objective::returns`]: members follow their means. Of the risk measures, only
-    /// `MeanStd` is differentiated (then without the disagreement term); otherwise, the weight of the disagreement multiplies the
-    /// standard deviation of the members' returns.
+    /// An approximation of the gradient of [`Objective::returns`]: members follow their means, to the horizon even where the task
+    /// terminates. Of the risk measures, only `MeanStd` is differentiated (then without the disagreement term); otherwise, the weight
+    /// of the disagreement multiplies the standard deviation of the members' returns.
     fn gradients(&mut self, sequences: &ActionSequences) -> (Vec<f32>, Vec<f32>) {
         let Imagination { dynamics, reward, .. } = self.imagination;
         let model = self.differentiable.get_or_insert_with(|| Differentiable::new(dynamics));

@@ -10,7 +10,7 @@ use crate::rng;
 
 impl Agent for Sac {
     fn begin_episode(&mut self) {
-        self.replay.close();
+        self.replay.cut_off();
         self.forget_episode();
         self.slots.clear(0);
     }
@@ -43,7 +43,7 @@ impl Agent for Sac {
         match self.decision.join(transition, self.config.action_repeat) {
             Some(Over::Whole(decision)) => self.replay.push(&decision),
             // It tells nothing about a whole decision.
-            Some(Over::Short(_)) => self.replay.close(),
+            Some(Over::Short(_)) => self.replay.cut_off(),
             None => {}
         }
         self.observed += 1;

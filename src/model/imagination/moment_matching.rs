@@ -62,7 +62,9 @@ impl Rollout<'_> {
                 variance += moments.epistemic(j) / (typical * typical);
             }
             dynamics.features.recompute_derived(next);
-            self.disagreement[row % candidates] += (variance / predicted.len() as f32).sqrt() / particles as f32;
+            if self.alive[row] {
+                self.disagreement[row % candidates] += (variance / predicted.len() as f32).sqrt() / particles as f32;
+            }
         }
     }
 
@@ -85,8 +87,8 @@ impl Rollout<'_> {
         MixtureMoments { means, squares, aleatoric }
     }
 
-    /// Replaces each candidate's particles by samples from a Gaussian with independent components fitted to them. `noise` is
-    /// `[particles, outputs]`.
+    /// Replaces each candidate's particles by samples from a Gaussian with independent components fitted to them, also to those
+    /// whose task has terminated. `noise` is `[particles, outputs]`.
     fn resample(&mut self, noise: &[f32]) {
         let dynamics = self.imagination.dynamics;
         let (width, outputs) = (dynamics.observation_size(), dynamics.outputs());

@@ -23,7 +23,7 @@ pub(super) struct Rollout<'a> {
     /// Rewards of the current time step, `[particles, candidates]`.
     pub rewards: Vec<f32>,
     /// Whether the task has not terminated yet, `[particles, candidates]`.
-    alive: Vec<bool>,
+    pub alive: Vec<bool>,
     /// Sums of rewards, `[candidates, particles]`.
     returns: &'a mut [f32],
     /// Sums of the members' disagreement, `[candidates]`.

@@ -78,7 +78,7 @@ fn the_std_of_noise_grows_with_the_root_of_time() {
 }
 
 /// Rewards are 1, 2, 3, 4 and 5, where the task terminates: that reward still counts, nothing after it, nor the terminal
-/// value.
+/// value, nor what the members disagree on.
 #[test]
 fn no_reward_counts_after_termination() {
     let dynamics = disagreeing(0.0, 1e-8);
@@ -90,6 +90,18 @@ fn no_reward_counts_after_termination() {
     let near = |found: f32, expected: f32| assert!((found - expected).abs() < 1e-3, "{found}, expected {expected}");
     near(imagined.returns[0], 15.0);
     near(imagined.returns[2], 18.0 + 100.0);
+    let dynamics = disagreeing(0.01, 1e-8);
+    for propagation in
+        [Propagation::TsInf, Propagation::TsInfMean, Propagation::Expectation, Propagation::MomentMatching]
+    {
+        let until = |horizon: usize, action: f32| {
+            let imagination = imagine(&dynamics, propagation, 2);
+            let actions = vec![action; horizon];
+            imagination.imagined_returns(&[0.0], &actions, horizon, &mut rng::stream(2, "end")).disagreement[0]
+        };
+        near(until(8, 1.0), until(5, 1.0));
+        assert!(until(8, 0.5) > until(5, 0.5) + 0.02, "{propagation:?}");
+    }
 }
 
 /// The same bits from one thread and from several, and for a candidate alone and among others.

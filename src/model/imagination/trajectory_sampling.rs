@@ -44,7 +44,7 @@ impl Rollout<'_> {
     pub(super) fn add_member_disagreement(&mut self, noise: StepNoise) {
         let dynamics = self.imagination.dynamics;
         let width = dynamics.observation_size();
-        let (members, candidates) = (dynamics.members(), self.candidates);
+        let (members, candidates, particles) = (dynamics.members(), self.candidates, self.particles);
         let particles_per_member = noise.order.len() / members;
         let mut means = vec![0.0; members * width];
         for (c, disagreement) in self.disagreement.iter_mut().enumerate() {
@@ -62,7 +62,8 @@ impl Rollout<'_> {
                     squares / members as f32 / (typical * typical)
                 })
                 .sum();
-            *disagreement += (variance / dynamics.features.predicted.len() as f32).sqrt();
+            let alive = (0..particles).filter(|p| self.alive[p * candidates + c]).count() as f32 / particles as f32;
+            *disagreement += alive * (variance / dynamics.features.predicted.len() as f32).sqrt();
         }
     }
 }

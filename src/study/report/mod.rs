@@ -124,7 +124,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
         "All methods of a task are evaluated from the same initial states and tested from the same initial states, without exploration \
          noise (planners still sample their candidates). The test is of the agent at the end of training; no earlier one is selected. \
          Every environment step of training counts, also in the random warm-up. Every number on this page comes from the study's \
-         `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv` and `summary.csv`",
+         tables: `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv`, `replays.csv`, `runs.csv` and `summary.csv`",
     );
     let configured = tables.runs()?.iter().any(|run| !run.configuration.is_empty());
     text += if configured { "; settings, from its `runs.csv`, are listed at the end.\n" } else { ".\n" };
@@ -164,9 +164,9 @@ fn caveat(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
         ),
         n => format!(
             "Each learning method has at least {n:.0} seeds. With five, a two-level bootstrap that should cover the truth in 95 % of cases \
-             covers it in 85 to 95 %, the less the more the seeds differ. A bootstrap over seeds alone covers ratios in about 85 %, and \
-             probabilities of improvement in as many unless they are near 0 or 1, where it covers far fewer. Where there is a t interval \
-             over seeds, it is the safer one. None of them accounts for a failure so rare that no seed shows it.\n"
+             covers it in 85 to 95 %; the more the seeds differ, the fewer. A bootstrap over seeds alone covers ratios and probabilities of \
+             improvement in about 85 %, and probabilities near 0 or 1 in far fewer. Where there is a t interval over seeds, it is the safer \
+             one; where most seeds are at 0 or 100 %, both cover less. No interval accounts for a failure so rare that no seed shows it.\n"
         ),
     })
 }

@@ -28,15 +28,15 @@ pub(super) fn section(tables: &Tables) -> Result<String> {
          machines, and from machines that several runs shared.\n\
          - *SPARC*, *LDLJ*: spectral arc length and log dimensionless jerk of the hand's path; closer to zero is smoother.\n\
          - *area under the curve*: the mean success rate up to the smallest budget, with a t interval over seeds (none where all agree).\n\
-         - *gradient updates*: steps of the optimiser (of the critics, for `sac`; of the ensemble, for `pets`). Batches differ, so these \
+         - *gradient updates*: steps of the optimiser (of the critics, for `sac`; of the ensemble, for `pets` and `pets-learned`). Batches differ, so these \
          numbers do not compare between methods.\n\
          - *action change*: root mean square of the change from one action to the next in the test.\n\
          - *optimism*: (expected - realised return) / |realised return| in the last evaluation, of means over time steps and seeds. Methods \
          with a value function expect the value of their policy (of `sac`, a soft value, which includes entropies), and realise the \
          discounted rewards that followed plus, at the time limit, the discounted value of the last observation, which makes optimism look \
-         smaller. `pets` expects what a plan predicts for its horizon, and realises the sum over that horizon, both undiscounted, in the \
-         reward that it plans with, without a terminal value, in four episodes. Only methods of one kind compare. *Correlation* is that of \
-         the two over time steps, its mean over seeds.\n\
+         smaller. `pets` and `pets-learned` expect what a plan predicts for its horizon, and realise the sum over that horizon, both \
+         undiscounted, in the reward that they plan with, without a terminal value, in four episodes. Compare only methods of the same kind. \
+         *Correlation* is that of the two over time steps, its mean over seeds.\n\
          - *return minus `{BASELINE}`'s*: the difference of mean test returns, with a t interval over seeds.\n\
          - *better*, *earlier*: the probability that a seed has more test success than one of `{BASELINE}`, or reaches {level:.0} % by an \
          earlier step (probability of improvement; 0.5 means no difference; ties, and pairs whose order is unknown because of censoring, \

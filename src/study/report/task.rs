@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::super::figures;
 use super::super::replays::{self, Replay};
+use super::super::statistics::falls_below_again;
 use super::super::tables::{BASELINE, Curve, LEVEL, Tables};
 use crate::error::Result;
 
@@ -88,7 +89,10 @@ fn findings(tables: &Tables, task: &str, by_return: bool) -> Result<String> {
         let (Some(budget), Some(reaching), Some(seeds)) =
             (value("steps")?, value("seeds_reaching_80")?, value("seeds")?)
         else {
-            text += &format!("- `{method}` does not learn; it succeeds in {success:.0} % of the test episodes.\n");
+            let episodes = value("test_episodes")?.unwrap_or(0.0);
+            text += &format!(
+                "- `{method}` does not learn; it succeeds in {success:.0} % of {episodes:.0} test episodes.\n"
+            );
             continue;
         };
         text += &match value("steps_to_80")? {
@@ -103,12 +107,18 @@ fn findings(tables: &Tables, task: &str, by_return: bool) -> Result<String> {
         };
         text += &match interval(tables, task, &method, "success_t")? {
             (Some(low), Some(high)) => {
-                format!(" (t interval over its {seeds:.0} seeds: [{:.0}, {:.0}]).", 100.0 * low, 100.0 * high)
+                format!(" (t interval over its {seeds:.0} seeds: [{:.0}, {:.0}])", 100.0 * low, 100.0 * high)
             }
             _ if seeds < 2.0 => {
-                " (one seed: the interval covers its test episodes, not what another seed would bring).".into()
+                " (one seed: the interval covers its test episodes, not what another seed would bring)".into()
             }
-            _ => ".".into(),
+            _ => String::new(),
+        };
+        let curves = tables.curves(task, &method)?;
+        text += &match curves.iter().filter(|(steps, success)| falls_below_again(LEVEL, steps, success)).count() {
+            0 => ".".into(),
+            1 => format!("; 1 seed is below {level:.0} % again at a later evaluation."),
+            n => format!("; {n} seeds are below {level:.0} % again at a later evaluation."),
         };
         text += &against_the_baseline(tables, task, &method)?;
         text.push('\n');
@@ -220,7 +230,13 @@ fn difference(
         (Some(low), Some(high)) => format!(" [{from}, {to}], t interval [{}, {}]", text(low), text(high)),
         _ => format!(" [{from}, {to}]"),
     };
-    Ok(format!(" {measure} from the same test starts, minus that of `{BASELINE}`: {value}{unit}{intervals}."))
+    let budgets = match (tables.value(task, method, "steps")?, tables.value(task, BASELINE, "steps")?) {
+        (Some(steps), Some(baseline)) if steps != baseline => {
+            format!(" (after {steps:.0} steps; `{BASELINE}` after {baseline:.0})")
+        }
+        _ => String::new(),
+    };
+    Ok(format!(" {measure} from the same test starts{budgets}, minus that of `{BASELINE}`: {value}{unit}{intervals}."))
 }
 
 /// A number with its sign and one decimal; zero is positive.
@@ -245,8 +261,8 @@ fn evaluations(tables: &Tables, task: &str, differ: bool) -> Result<String> {
     let Some((_, first)) = grids.first() else { return Ok(String::new()) };
     if !differ {
         return Ok(format!(
-            "\nEvaluations: {}, always from the same starts. The step of {:.0} % success is rounded up to these steps; with so few episodes, \
-             it may also be several evaluations too late or too early.\n",
+            "\nEvaluations: {}, always from the same starts. The step of {:.0} % success is rounded up to these steps, which the intervals \
+             do not include; with so few episodes, it may also be several evaluations too late or too early.\n",
             one(first),
             100.0 * LEVEL
         ));

@@ -286,6 +286,12 @@ pub fn steps_to(level: f64, steps: &[f64], success: &[f64]) -> Option<f64> {
     reached.map(|i| steps[i])
 }
 
+/// Whether the success rate is below `level` again at an evaluation after the step that [`steps_to`] gives.
+pub fn falls_below_again(level: f64, steps: &[f64], success: &[f64]) -> bool {
+    let Some(by) = steps_to(level, steps, success) else { return false };
+    steps.iter().zip(success).any(|(step, rate)| *step > by && *rate < level)
+}
+
 /// The median of times of which some are right-censored (`None`), all at the same budget, as Kaplan & Meier (JASA 53, 1958)
 /// estimate it; between the middle two for an even number. `None` if it is censored itself.
 #[doc(alias = "Kaplan-Meier")]

@@ -300,7 +300,7 @@ impl Tables {
 fn inside(problem: PolarsError) -> Error {
     let problem = problem.to_string();
     Error::Config(format!(
-        "the tables of the study are inconsistent ({}); restore them, or run its command again",
+        "the tables of the study are inconsistent ({}); restore them, or repeat the command that made them",
         problem.lines().next().unwrap_or_default()
     ))
 }
