@@ -34,6 +34,15 @@ impl KnownReward for Position {
     }
 }
 
+/// A task that goes on for ever.
+struct Endless;
+
+impl KnownReward for Endless {
+    fn reward(&self, _obs: &[f32], _action: &[f32], next_obs: &[f32]) -> f32 {
+        next_obs[0]
+    }
+}
+
 fn imagine(dynamics: &Dynamics, propagation: Propagation, particles: usize) -> Imagination<'_> {
     Imagination { dynamics, reward: Reward::Known(&Position), propagation, particles, value: None }
 }
@@ -50,8 +59,8 @@ fn disagreement_accumulates_with_ts_inf_only() {
     let dynamics = disagreeing(1.0, 1e-3);
     let run = |propagation, particles| {
         let mut rng = rng::stream(0, "propagation");
-        let (trajectories, imagined) =
-            imagine(&dynamics, propagation, particles).trajectories(&[0.0], &[0.0; 16], 16, &mut rng);
+        let imagination = Imagination { reward: Reward::Known(&Endless), ..imagine(&dynamics, propagation, particles) };
+        let (trajectories, imagined) = imagination.trajectories(&[0.0], &[0.0; 16], 16, &mut rng);
         (mean_and_std(&trajectories[16]), imagined.disagreement[0])
     };
     let ((mean, std), disagreement) = run(Propagation::TsInf, 400);
