@@ -328,6 +328,8 @@ mod tests {
                 assert_eq!(buffer.serial(row), buffer.row(row).obs[0] as u64);
                 assert_eq!(resumed.serial(row), buffer.serial(row));
             }
+            // In a larger buffer, the order of a ring would be lost.
+            assert_eq!(ReplayBuffer::new(1, 1, 9).load(&state, "replay").is_err(), buffer.len() == 7);
             let mut old = Weights::default();
             old.insert("replay.rows", buffer.rows.clone(), [1, buffer.len(), buffer.width()]);
             old.insert_counts("replay.next", &[buffer.next() as u64]);

@@ -293,15 +293,9 @@ pub(crate) fn bad_config(path: &Path, source: &toml::de::Error) -> Error {
     let problem = match unknown {
         Some((field, known)) => {
             let known: Vec<&str> = known.split('`').skip(1).step_by(2).collect();
-            let unknown = Error::unknown("field", field, known.iter().copied());
+            let said = Error::unknown("field", field, known.iter().copied()).to_string();
             let at_the_top = known.contains(&"evaluate_every");
-            let hint = match unknown {
-                Error::UnknownName { closest: None, .. } if at_the_top => {
-                    "; settings of an agent belong in its table, such as `[sac]`"
-                }
-                _ => "",
-            };
-            format!("{unknown}{hint}")
+            if at_the_top { said + "; settings of an agent belong in its table, such as `[sac]`" } else { said }
         }
         None if message.contains("unit variant, expected newtype variant") => {
             "a name alone is not enough: write `{ NAME = VALUE }`, or `{ NAME = {} }` if its value is a table of settings".into()

@@ -69,9 +69,10 @@ pub struct Summary {
     pub episodes: usize,
     /// Success rate.
     pub success: f64,
-    /// Lower end of the 95 % Wilson interval of this one agent's success rate. Its episodes are independent
-    /// of each other, but for the random numbers of a planner, which episodes that are 20 apart share; those of agents trained with
-    /// several seeds are not, and [`two_level_bootstrap`](super::statistics::two_level_bootstrap) is for them. Not a number in what earlier versions recorded during training.
+    /// Lower end of the 95 % Wilson interval of this one agent's success rate. Its episodes are independent of each other, but for
+    /// the random numbers of a planner, which episodes that are 20 apart share; those of agents trained with several seeds are not,
+    /// and [`two_level_bootstrap`](super::statistics::two_level_bootstrap) is for them. Not a number in what earlier versions
+    /// recorded during training.
     #[serde(default = "unknown")]
     pub success_low: f64,
     /// Its upper end.

@@ -62,7 +62,7 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     item("each agent is tested in at least 100 episodes", &short);
     let tuning = tables.starts()? == Starts::Development;
     let tuned = if tuning { vec!["these are development starts".into()] } else { Vec::new() };
-    item("no run was trained or evaluated on the starts of its test before the test", &tuned);
+    item("the starts of the test are new to every run: neither its training nor its evaluations used them", &tuned);
     item("one version of the library, with its sources committed, made all runs", &versions(&tables.runs()?));
     Ok(text
         + "\nRuns that do not reach the level count as right-censored. What the tables cannot tell: whether settings were chosen after results \

@@ -265,7 +265,7 @@ fn numbers_must_fit_together() {
 
 /// Another planner takes the place of the preset's; the same one keeps what the file does not change.
 #[test]
-fn a_file_can_choose_any_planner() {
+fn a_file_can_choose_any_planner_that_suits_the_agent() {
     let kinds = ["shooting", "cem", "icem", "mppi", "guided", "gradient", "hybrid"];
     for (method, agent) in [("pets", "pets"), ("oracle", "oracle"), ("planet", "dreamer")] {
         for kind in kinds {

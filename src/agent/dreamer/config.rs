@@ -18,7 +18,8 @@ pub struct DreamerConfig {
     pub world: WorldModelConfig,
     /// Settings of actor and critic.
     pub behaviour: ActorCriticConfig,
-    /// Plans in the latent space of the world model instead of asking the policy, if there is a planner (PlaNet).
+    /// Plans in the latent space of the world model instead of asking the policy, if there is a planner (PlaNet). Not `gradient` or
+    /// `hybrid`: every sequence is imagined with random numbers of its own.
     pub planner: Option<PlannerConfig>,
     /// How often it replans, and how long each action is repeated.
     pub control: ControlConfig,

@@ -152,8 +152,8 @@ pub struct ImaginedReturns {
     pub returns: Vec<f32>,
     /// Disagreement of the members (epistemic uncertainty) along each candidate, `[candidates]`, summed over time steps: the
     /// standard deviation between members in units of the typical change per time step, root mean square over the
-    /// predicted features, times the share of particles whose task has not terminated. With [`Propagation::TsInf`] and [`Propagation::Ts1`] it compares means of sampled particles, so that their
-    /// aleatoric noise adds to it.
+    /// predicted features, times the share of particles whose task has not terminated. With [`Propagation::TsInf`] and
+    /// [`Propagation::Ts1`] it compares means of sampled particles, so that their aleatoric noise adds to it.
     #[doc(alias = "epistemic uncertainty")]
     pub disagreement: Vec<f32>,
 }

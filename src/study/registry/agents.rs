@@ -151,7 +151,7 @@ pub(super) fn register(registry: Registry) -> Registry {
         .add_agent(oracle)
         .add_agent(scripted)
         .policy("random", |context, NoOptions {}| Ok(Random::new(context.spec, context.seed)))
-        .add_agent(sac.with_ranges::<SacConfig>().trained_with(&["latent_features", "action_repeat"]))
+        .add_agent(sac.with_ranges::<SacConfig>().trained_with(&["latent_features"]))
         .add_agent(dreamer.with_ranges::<DreamerConfig>().trained_with(&["world", "action_repeat"]))
         .add_agent(tdmpc2.with_ranges::<TdMpc2Config>().trained_with(&["model", "action_repeat", "reward_unit"]))
         .add_agent(pets.with_ranges::<PetsConfig>().trained_with(&["ensemble.reward_unit", "action_repeat"]))

@@ -124,7 +124,7 @@ fn terms(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
         "All methods of a task are evaluated from the same initial states and tested from the same initial states, without exploration \
          noise (planners still sample their candidates). The test is of the agent at the end of training; no earlier one is selected. \
          Every environment step of training counts, also in the random warm-up. Every number on this page comes from the study's \
-         tables: `tests.csv`, `evaluations.csv`, `models.csv`, `values.csv`, `replays.csv`, `runs.csv` and `summary.csv`",
+         tables (CSV files)",
     );
     let configured = tables.runs()?.iter().any(|run| !run.configuration.is_empty());
     text += if configured { "; settings, from its `runs.csv`, are listed at the end.\n" } else { ".\n" };
