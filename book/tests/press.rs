@@ -293,6 +293,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ),
         ("README.md", format!("whose dynamics have no lasso, they are {:.2} and {:.1}", pets[0], pets[1])),
     ]);
+    let by = thousands(in_study("push-learned", "push", "pets-learned", "steps_to_80"));
+    let [successes] = test_successes("push-learned", "push", "pets-learned")[..] else { panic!("one seed") };
+    let learned = format!("is at 80 % by step {by}, and succeeds in {successes} of 100 test episodes after 20,000");
+    quotes.push(("README.md", learned));
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
     for (name, method) in
         [("PETS (knows the reward)", "pets"), ("TD-MPC2", "tdmpc2"), ("Dreamer", "dreamer"), ("SAC", "sac")]
