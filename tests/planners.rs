@@ -401,3 +401,29 @@ fn a_planner_of_ones_own_enters_pets_and_the_oracle() {
     pets.load_training_state(&state).expect("its own state");
     assert!(extremes(&pets.act(&obs, Mode::Explore)));
 }
+
+/// The observer sees candidates, of which none need be the plan.
+#[test]
+fn the_last_plan_is_the_one_that_is_executed() {
+    struct Fixed;
+    impl Planner for Fixed {
+        fn plan(&mut self, _: &mut dyn Objective, observer: &mut PlanObserver, _: &mut Rng) -> Plan {
+            let candidates = ActionSequences { horizon: 2, actions: 1, values: vec![1.0, 1.0] };
+            observer(&Iteration { index: 0, candidates: &candidates, returns: &[5.0], mean: &[0.0, 0.0] });
+            Plan { actions: vec![0.5, -0.5], best_return: 5.0 }
+        }
+        fn shift(&mut self, _: usize) {}
+        fn reset(&mut self) {}
+    }
+    let config = ControlConfig { action_repeat: 2, ..ControlConfig::default() };
+    let mut controller = RecedingHorizon::new(Box::new(Fixed), 1, &config);
+    let mut rng = rng::stream(0, "last plan");
+    let mut act = |controller: &mut RecedingHorizon| {
+        controller.act(&mut |c: &ActionSequences| vec![0.0; c.count()], &mut |_| {}, &mut rng)
+    };
+    assert!(controller.last_plan().is_empty());
+    assert_eq!(act(&mut controller), [0.5]);
+    assert_eq!(controller.last_plan(), [0.5, 0.5, -0.5, -0.5]);
+    assert_eq!(act(&mut controller), [0.5]);
+    assert!(controller.last_plan().is_empty(), "it went on with the plan before");
+}

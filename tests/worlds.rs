@@ -282,9 +282,14 @@ fn the_reward_in_logarithm_pulls_from_afar() {
     for task in [Task::Reach, Task::Push, Task::Lift, Task::Stack, Task::Door] {
         let (mut shaped, mut env) = (task.make(), task.make_with(log).expect("an arm task"));
         let policy = task.scripted_policy(log).expect("each has one");
-        let mut obs = env.reset(0);
-        shaped.reset(0);
-        let first = env.reward(&obs, &[0.0; 4], &obs);
+        // Of some starts, the one that is farthest from success: near it, there is little to gain.
+        let start = |env: &mut World, seed: u64| {
+            let obs = env.reset(seed);
+            (env.reward(&obs, &[0.0; 4], &obs), obs)
+        };
+        let far = (0..5).min_by(|&a, &b| start(&mut env, a).0.total_cmp(&start(&mut env, b).0)).expect("five starts");
+        let (first, mut obs) = start(&mut env, far);
+        shaped.reset(far);
         let mut last = None;
         for _ in 0..env.spec().horizon {
             let action = policy(&obs);
