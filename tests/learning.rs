@@ -722,7 +722,9 @@ fn trained_agents_that_ship_still_succeed() {
             let evaluation = evaluator.evaluate(&mut method, episodes, EvalSeeds::Seed(1)).expect("valid actions");
             (evaluation.summary().success * episodes as f64).round()
         };
-        // Seven in the first seven are seven of ten.
-        assert!(successes(7) == 7.0 || successes(10) >= 7.0, "{}", folder.display());
+        // Seven in the first seven are seven of ten. Of ten, an agent that succeeds in 86 % has fewer in one case of 25; of sixty, it has
+        // fewer than seven tenths in one of several thousand.
+        let enough = successes(7) == 7.0 || successes(10) >= 7.0 || successes(60) >= 42.0;
+        assert!(enough, "{}", folder.display());
     });
 }
