@@ -124,9 +124,18 @@ fn test_successes(study: &str, task: &str, method: &str) -> Vec<usize> {
 
 /// The step by which each seed of a method is at 80 %, in the study of the task.
 fn steps_to_80(task: &str, method: &str) -> Vec<f64> {
-    let tables = Tables::read(&root().join("data/study").join(task)).expect("tables");
-    let curves = tables.curves(task, method).expect("curves");
-    curves.iter().map(|(steps, success)| steps_to(0.8, steps, success).expect("no seed is censored")).collect()
+    curves(task, task, method).iter().map(step_of_80).collect()
+}
+
+/// The step by which a seed that is not censored is at 80 %.
+fn step_of_80((steps, success): &(Vec<f64>, Vec<f64>)) -> f64 {
+    steps_to(0.8, steps, success).expect("no seed is censored")
+}
+
+/// The learning curve of each seed of a method: steps and success rates.
+fn curves(study: &str, task: &str, method: &str) -> Vec<(Vec<f64>, Vec<f64>)> {
+    let tables = Tables::read(&root().join("data/study").join(study)).expect("tables");
+    tables.curves(task, method).expect("curves")
 }
 
 /// What the five seeds of a method have, as a text lists it.
@@ -181,13 +190,15 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         }
     };
     let mut quotes: Vec<(&str, String)> = Vec::new();
-    for (name, study, method) in [
-        ("random", "reach", "random"),
-        ("scripted (by hand)", "reach", "scripted"),
-        ("oracle (plans on the true simulator)", "oracle", "oracle"),
-    ] {
-        let (success, sparc) = (success(study, "reach", method), in_study(study, "reach", method, "smoothness_sparc"));
+    for (name, method) in [("random", "random"), ("scripted (by hand)", "scripted")] {
+        let (success, sparc) = (success("reach", "reach", method), reach(method, "smoothness_sparc"));
         quotes.push(("README.md", format!("| {name} | {success} | - | - | - | {sparc:.2} |")));
+    }
+    for (task, columns, digits) in [("reach", "- | - | -", 2), ("lift", "- | -", 1), ("push", "- | - | -", 1)] {
+        let (success, sparc) =
+            (success("oracle", task, "oracle"), in_study("oracle", task, "oracle", "smoothness_sparc"));
+        let row = format!("| oracle (plans on the true simulator) | {success} | {columns} | {sparc:.digits$} |");
+        quotes.push(("README.md", row));
     }
     for (name, method, digits) in [
         ("PETS (knows the reward)", "pets", 1),
@@ -215,9 +226,6 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         let (success, ratio) = (success("lift", "lift", method), ratio("lift", method));
         quotes.push(("README.md", format!("| {name} | {success} | {steps} ({seeds}) | {ratio} | {sparc:.1} |")));
     }
-    let oracle = success("oracle", "lift", "oracle");
-    let sparc = in_study("oracle", "lift", "oracle", "smoothness_sparc");
-    quotes.push(("README.md", format!("| oracle (plans on the true simulator) | {oracle} | - | - | {sparc:.1} |")));
     for (study, task, plan) in [
         ("oracle", "reach", "4 actions, each held 2 steps | 2 x 20 | 45"),
         ("oracle", "push", "10 actions, each held 3 steps; the final reward counts 100 times | 4 x 64 | 1,150"),
@@ -293,15 +301,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ),
         ("README.md", format!("whose dynamics have no lasso, they are {:.2} and {:.1}", pets[0], pets[1])),
     ]);
-    let tables = Tables::read(&root().join("data/study/push-learned")).expect("tables");
-    let curves = tables.curves("push", "pets-learned").expect("curves");
-    let by =
-        curves.iter().map(|(steps, success)| thousands(steps_to(0.8, steps, success).expect("no seed is censored")));
-    let [by, successes] = [
-        by.collect::<Vec<String>>(),
-        test_successes("push-learned", "push", "pets-learned").iter().map(ToString::to_string).collect(),
-    ]
-    .map(|of_seeds| of_seeds.join(" and "));
+    let seeds = curves("push-learned", "push", "pets-learned");
+    let by = seeds.iter().map(|curve| thousands(step_of_80(curve))).collect::<Vec<String>>().join(" and ");
+    let successes = test_successes("push-learned", "push", "pets-learned");
+    let successes = successes.iter().map(ToString::to_string).collect::<Vec<String>>().join(" and ");
     let learned = format!("are at 80 % by steps {by}, and succeed in {successes} of 100 test episodes after 20,000");
     quotes.push(("README.md", learned));
     let push = |method: &str, column: &str| in_study("push", "push", method, column);
@@ -319,9 +322,6 @@ fn numbers_from_studies_are_quoted_as_they_are() {
             format!("| {name} | {success} | {steps} | {by} ({reaching} of {seeds}) | {ratio} | {sparc:.1} |"),
         ));
     }
-    let oracle = success("oracle", "push", "oracle");
-    let sparc = in_study("oracle", "push", "oracle", "smoothness_sparc");
-    quotes.push(("README.md", format!("| oracle (plans on the true simulator) | {oracle} | - | - | - | {sparc:.1} |")));
     let [seeds, reaching] = ["seeds", "seeds_reaching_80"]
         .map(|column| ["pets", "sac", "tdmpc2", "dreamer"].map(|method| push(method, column)));
     assert_eq!((seeds, reaching), ([5.0; 4], [5.0, 5.0, 4.0, 5.0]));
@@ -366,15 +366,13 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         format!("by {} to {}", thousands(first), thousands(last))
     };
     let [pets, learned, sac, tdmpc2, dreamer] = ["pets", "pets-learned", "sac", "tdmpc2", "dreamer"].map(range);
-    let curves = format!(
+    let figure = format!(
         "PETS is at 80 % {pets}; PETS with a learned reward {learned}; SAC {sac}; TD-MPC2 {tdmpc2}; Dreamer {dreamer}]"
     );
-    quotes.extend(["README.md", "chapters/00-start.md"].map(|file| (file, curves.clone())));
+    quotes.extend(["README.md", "chapters/00-start.md"].map(|file| (file, figure.clone())));
     let falling = |task: &str, methods: &[&str]| {
-        let tables = Tables::read(&root().join("data/study").join(task)).expect("tables");
         let of_method = |method: &&str| {
-            let curves = tables.curves(task, method).expect("curves");
-            curves.iter().filter(|(steps, success)| falls_below_again(0.8, steps, success)).count()
+            curves(task, task, method).iter().filter(|(steps, success)| falls_below_again(0.8, steps, success)).count()
         };
         methods.iter().map(of_method).collect::<Vec<usize>>()
     };
@@ -404,14 +402,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     quotes.push(("README.md", format!("would be {known} with the known reward and {learned} with a learned one")));
     // If all had been evaluated every 500 steps only.
     let coarser = |method: &str| -> Vec<f64> {
-        let tables = Tables::read(&root().join("data/study/reach")).expect("tables");
-        let curves = tables.curves("reach", method).expect("curves");
-        let time = |(steps, success): &(Vec<f64>, Vec<f64>)| {
-            let kept = steps.iter().zip(success).filter(|(step, _)| **step % 500.0 == 0.0);
-            let (steps, success): (Vec<f64>, Vec<f64>) = kept.unzip();
-            steps_to(0.8, &steps, &success).expect("no seed is censored")
+        let at_500 = |(steps, success): &(Vec<f64>, Vec<f64>)| {
+            step_of_80(&steps.iter().zip(success).filter(|(step, _)| **step % 500.0 == 0.0).unzip())
         };
-        curves.iter().map(time).collect()
+        curves("reach", "reach", method).iter().map(at_500).collect()
     };
     let sac = coarser("sac");
     let [known, learned] = ["pets", "pets-learned"].map(|method| {
