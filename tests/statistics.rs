@@ -18,8 +18,8 @@ use handful::study::smoothness::{action_change, ldlj, of_path, sparc};
 use handful::study::starts::{LIMIT, Starts, training_seed};
 use handful::study::statistics::{
     Time, area_under_curve, bootstrap, censored_median, falls_below_again, interquartile_mean, mean, paired_difference,
-    probability_of_being_earlier, probability_of_improvement, ratio_of_means, ratio_t_interval, restricted_mean,
-    steps_to, t_interval, two_level_bootstrap, welch_interval, wilson,
+    performance_profile, probability_of_being_earlier, probability_of_improvement, ratio_of_means, ratio_t_interval,
+    restricted_mean, steps_to, t_interval, two_level_bootstrap, welch_interval, wilson,
 };
 use rayon::prelude::*;
 
@@ -56,9 +56,17 @@ fn smoothness_of_known_movements() {
         near("minimum jerk: SPARC", sparc(&speed, rate), spectral, 1e-7);
         near("minimum jerk: LDLJ", ldlj(&along_x(&speed), rate), jerk, 1e-7);
     }
+    // Sampled ever faster, the dimensionless jerk becomes that of the formula, 204.8.
+    near("minimum jerk: limit", ldlj(&along_x(&minimum_jerk(1.0, 1.0, 1e4)), 1e4), -5.322_033_89, 3e-4);
+    // Two movements, with one sample at rest between them.
+    let half = minimum_jerk(0.5, 0.5, 100.0);
+    let twice = [&half[..], &half[1..]].concat();
+    near("two movements: SPARC", sparc(&twice, 100.0), -2.244_546_17, 1e-7);
+    near("two movements: LDLJ", ldlj(&along_x(&twice), 100.0), -8.073_222_24, 1e-7);
     // Tremor of 8 Hz: small ones stay below SPARC's threshold, LDLJ sees them all.
     for (tremor, spectral, jerk) in [
         (0.05, -1.405_810_30, -7.762_338_84),
+        (0.10, -1.405_753_29, -9.033_495_69),
         (0.15, -1.878_165_32, -9.781_943_52),
         (0.30, -2.004_585_34, -11.017_236_94),
     ] {
@@ -106,6 +114,29 @@ fn interquartile_means() {
     near("ten", interquartile_mean(&[0.1, 0.9, 0.4, 0.7, 0.2, 0.6, 0.5, 0.3, 1.0, 0.8]), 0.55, 1e-12);
     near("outliers", interquartile_mean(&[-5.0, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 9.0]), 0.325, 1e-12);
     near("floor rule", interquartile_mean(&[3.0, 1.0, 4.0, 1.5, 9.0, 2.6]), 2.775, 1e-12);
+    near("nothing is dropped of three", interquartile_mean(&[0.0, 0.0, 0.9]), 0.3, 1e-12);
+    near("three are kept of five", interquartile_mean(&[0.1, -5.0, 0.6, 0.2, 9.0]), 0.3, 1e-12);
+    // Pooled over unequal tasks, it leaves out runs of the easiest and the hardest.
+    let rates = SUCCESSES.concat().iter().map(|n| *n as f64 / 20.0).collect::<Vec<f64>>();
+    near("three tasks", interquartile_mean(&rates), 0.7444, 1e-4);
+    near("the mean of three tasks", mean(&rates), 0.6667, 1e-4);
+}
+
+/// Five runs each of two methods on two tasks.
+#[test]
+fn scores_of_two_methods() {
+    let first: [[f64; 5]; 2] = [[0.2, 0.5, 0.4, 0.7, 0.3], [0.9, 0.8, 1.1, 0.6, 1.0]];
+    let second: [[f64; 5]; 2] = [[0.1, 0.6, 0.2, 0.3, 0.4], [0.7, 0.8, 0.9, 0.5, 1.2]];
+    for (scores, middle, profile) in [(first, 0.65, [0.8, 0.6, 0.3, 0.1]), (second, 0.55, [0.7, 0.5, 0.2, 0.1])] {
+        near("interquartile mean", interquartile_mean(&scores.concat()), middle, 1e-12);
+        assert_eq!(performance_profile(&scores.concat(), &[0.3, 0.5, 0.8, 1.0]), profile);
+    }
+    let mut rng = rng::stream(0, "improvement test");
+    for (task, expected) in [0.66, 0.60].into_iter().enumerate() {
+        let (better, [low, high]) = probability_of_improvement(&first[task], &second[task], &mut rng);
+        near("improvement", better, expected, 1e-12);
+        assert!(low < better && better < high, "{low} {high}");
+    }
 }
 
 #[test]
@@ -125,7 +156,22 @@ fn success_curves() {
     assert_eq!(steps_to(0.8, &steps, &falling), Some(30.0), "one high evaluation is not enough");
     assert!(falls_below_again(0.8, &steps, &falling) && !falls_below_again(0.8, &steps, &falling[..5]));
     assert!(!falls_below_again(0.9, &steps, &falling), "it has not been there");
+    // Between two evaluations, a straight line would reach 0.8 at 3,667 steps.
+    let steps = [0.0, 1000.0, 2000.0, 3000.0, 4000.0, 5000.0];
+    let success = [0.0, 0.1, 0.4, 0.7, 0.85, 0.9];
+    near("area", area_under_curve(&steps, &success, 5000.0), 0.5, 1e-12);
+    assert_eq!(steps_to(0.8, &steps, &success), Some(4000.0));
 }
+
+/// The mean ends of so many intervals: those of a single one have an error from its resamples that can be larger than the tolerance.
+fn on_average(count: usize, interval: impl FnMut() -> [f64; 2]) -> [f64; 2] {
+    let intervals: Vec<[f64; 2]> = std::iter::repeat_with(interval).take(count).collect();
+    [0, 1].map(|end| mean(&intervals.iter().map(|interval| interval[end]).collect::<Vec<_>>()))
+}
+
+/// Steps of two methods, five seeds each, in thousands, when those that do not get there count as the budget of 150.
+const SLOW: [f64; 5] = [60.0, 80.0, 100.0, 120.0, 150.0];
+const FAST: [f64; 5] = [40.0, 50.0, 50.0, 70.0, 90.0];
 
 /// Two methods, five seeds each, thousands of steps, budget 150; the last seed of the first does not get there.
 #[test]
@@ -153,14 +199,15 @@ fn censored_times() {
     // One that reaches the level at its last evaluation is censored there.
     assert_eq!(probability_of_being_earlier(&[Time::Reached(60.0)], &[Time::Censored(60.0)], &mut rng).0, 0.5);
     assert_eq!(probability_of_improvement(&[1.0], &[1.0, 1.0], &mut rng), (0.5, [0.5; 2]));
-    let (ratio, [low, high]) =
-        ratio_of_means(&[60.0, 80.0, 100.0, 120.0, 150.0], &[40.0, 50.0, 50.0, 70.0, 90.0], &mut rng);
-    near("ratio", ratio, 1.7, 1e-12);
-    // Exact, over all samples: 1.154 and 2.458. With 10,000 draws, a quantile's share of the distribution has a standard
-    // deviation of 0.0016, which is 0.02 of a ratio at the upper end.
-    near("low", low, 1.154, 0.02);
-    near("high", high, 2.458, 0.05);
+    near("ratio", ratio_of_means(&SLOW, &FAST, &mut rng).0, 1.7, 1e-12);
+    // Exact, over all samples. The upper end of a single interval has a standard deviation of 0.014.
+    let [low, high] = on_average(50, || ratio_of_means(&SLOW, &FAST, &mut rng).1);
+    near("low", low, 1.154, 0.01);
+    near("high", high, 2.458, 0.01);
 }
+
+/// Successes in 20 episodes of five seeds, on an easy, a middling and a hard task.
+const SUCCESSES: [[usize; 5]; 3] = [[20, 20, 19, 20, 18], [17, 12, 19, 4, 15], [9, 0, 14, 2, 11]];
 
 /// One agent's test: so many successes in 20 episodes.
 fn agents(successes: [usize; 5]) -> Vec<Vec<f64>> {
@@ -170,13 +217,10 @@ fn agents(successes: [usize; 5]) -> Vec<Vec<f64>> {
 /// Expected ends: exact, by convolution.
 #[test]
 fn the_two_level_bootstrap_of_three_tasks() {
-    let tasks = [[20, 20, 19, 20, 18], [17, 12, 19, 4, 15], [9, 0, 14, 2, 11]].map(agents);
+    let tasks = SUCCESSES.map(agents);
     let mut rng = rng::stream(0, "two-level test");
-    // The mean of several: a single interval has an error from its resamples that can be larger than the tolerance.
     let mut interval = |tasks: &[Vec<Vec<f64>>; 3]| {
-        let intervals: Vec<[f64; 2]> =
-            (0..25).map(|_| two_level_bootstrap(&[&tasks[0], &tasks[1], &tasks[2]], &mut rng)).collect();
-        [0, 1].map(|end| mean(&intervals.iter().map(|interval| interval[end]).collect::<Vec<_>>()))
+        on_average(25, || two_level_bootstrap(&[&tasks[0], &tasks[1], &tasks[2]], &mut rng))
     };
     let [low, high] = interval(&tasks);
     near("low", low, 0.5467, 0.004);
@@ -244,6 +288,45 @@ fn t_intervals_of_two_methods() {
     assert_eq!(welch_interval(&first, &[0.5]), None, "one seed says nothing about others");
 }
 
+/// The 97.5 % quantile for four degrees of freedom, those of five seeds.
+const OF_FIVE: f64 = 2.776_445;
+
+/// Welch and Satterthwaite's degrees of freedom of a sum, from the standard errors of its terms, each the mean of five seeds.
+fn satterthwaite(errors: &[f64]) -> f64 {
+    let sum = |power: i32| errors.iter().map(|error| error.powi(power)).sum::<f64>();
+    sum(2).powi(2) / (sum(4) / 4.0)
+}
+
+/// The reference takes Welch and Satterthwaite's degrees of freedom, here 8, and so a quantile of 2.3063. Ours takes the four
+/// of a single method, which makes its interval wider, because five seeds tell little of a variance; the ratio, and the
+/// standard error of its logarithm, are the reference's.
+#[test]
+fn the_interval_of_a_ratio_has_the_standard_error_of_the_references() {
+    let spread = |first: &[f64], second: &[f64]| {
+        let [low, high] = ratio_t_interval(first, second).expect("five seeds each");
+        ((low * high).sqrt(), (high / low).ln() / 2.0 / OF_FIVE)
+    };
+    let (ratio, error) = spread(&SLOW, &FAST);
+    near("ratio", ratio, 1.7, 1e-12);
+    near("from", ratio * (-2.306_295 * error).exp(), 1.04, 0.005);
+    near("to", ratio * (2.306_295 * error).exp(), 2.78, 0.005);
+    // Beside seeds that are all alike, one method's error stands alone.
+    near("freedom", satterthwaite(&[SLOW, FAST].map(|steps| spread(&steps, &[1.0; 5]).1)), 8.0, 0.01);
+}
+
+/// Three tasks have an interval of their own each in a report, and none together; but from their standard errors follows that of
+/// the reference, with Welch and Satterthwaite's 8.18 degrees of freedom and a quantile of 2.2973.
+#[test]
+fn standard_errors_of_three_tasks_make_the_t_interval_of_the_reference() {
+    let intervals = SUCCESSES.map(|of_task| t_interval(&of_task.map(|n| n as f64 / 20.0)).expect("five seeds"));
+    let errors = intervals.map(|[low, high]| (high - low) / 2.0 / OF_FIVE);
+    near("freedom", satterthwaite(&errors), 8.18, 0.005);
+    let middle = mean(&intervals.map(|[low, high]| (low + high) / 2.0));
+    let half = 2.297_273 * errors.iter().map(|error| error * error).sum::<f64>().sqrt() / 3.0;
+    near("low", middle - half, 0.5226, 1e-4);
+    near("high", middle + half, 0.8107, 1e-4);
+}
+
 /// A method in a study by hand: its name, the successes of each seed in 20 episodes, from which step on, and the steps between
 /// evaluations and of the last one.
 type ByHand = (&'static str, &'static [usize], usize, [usize; 2]);
@@ -284,7 +367,7 @@ fn a_verdict_needs_four_seeds() {
         report_in(folder.path())
     };
     let (four, three) = (of(&[20, 19, 20, 20]), of(&[20, 19, 20]));
-    assert!(four.contains("Significantly more test success than `sac`: `pets`."), "{four}");
+    assert!(four.contains("Significantly more test success than `sac`: `pets` (+45 [+"), "{four}");
     assert!(
         three.contains("Fewer than 4 seeds of one of the two, too few to compare test success with `sac`: `pets`."),
         "{three}"
@@ -292,7 +375,7 @@ fn a_verdict_needs_four_seeds() {
     let (fast, slow): (ByHand, ByHand) = (("pets", &[20; 4], 500, [500, 2000]), ("sac", &[20; 4], 1500, [500, 2000]));
     let folder = study_by_hand(&[fast, slow]);
     let report = report_in(folder.path());
-    assert!(report.contains("Significantly fewer steps to 80 % than `sac`: `pets`."), "{report}");
+    assert!(report.contains("Significantly fewer steps to 80 % than `sac`: `pets` (3.0 [3.0, 3.0])."), "{report}");
     assert!(report.contains("+0.0 percentage points, without an interval"), "{report}");
     // Nobody else was compared.
     assert!(
@@ -344,16 +427,52 @@ fn a_report_says_where_methods_do_not_have_the_same_environment() {
     assert!(older.contains("The runs on `pole` were made by different versions of the program"), "{older}");
 }
 
+/// Changes every row of a table, its header included.
+fn rewrite(path: &Path, change: &dyn Fn(&[&str]) -> String) {
+    let text = std::fs::read_to_string(path).expect("a table");
+    let rows = text.lines().map(|line| change(&line.split(',').collect::<Vec<_>>()) + "\n");
+    std::fs::write(path, rows.collect::<String>()).expect("a writable folder");
+}
+
+/// Four seeds each, 0.1 apart: a standard error of 0.0913 for the difference, and three degrees of freedom.
+#[test]
+fn smoothness_and_model_errors_stand_in_the_report() {
+    let folder = study_by_hand(&[("pets", &[20; 4], 500, [500, 1000]), ("sac", &[20; 4], 500, [500, 1000])]);
+    rewrite(&folder.path().join("tests.csv"), &|row| match row[2].parse::<f64>() {
+        Ok(seed) => {
+            let sparc = if row[1] == "pets" { -2.0 } else { -3.0 } - 0.1 * seed;
+            [&row[..8], &[&sparc.to_string()], &row[9..]].concat().join(",")
+        }
+        Err(_) => row.join(","),
+    });
+    let mut models = String::from("task,method,seed,step,horizon,rmse,nll,coverage90,rmse_p90\n");
+    for (seed, (error, coverage)) in [(0.5, 0.7), (0.2, 0.8), (0.3, 0.9), (0.4, 0.6)].into_iter().enumerate() {
+        models += &format!("pole,pets,{seed},500,1,9.0,,0.1,\npole,pets,{seed},1000,1,{error},,{coverage},\n");
+        models += &format!("pole,pets,{seed},1000,15,1.5,,0.5,\n");
+    }
+    std::fs::write(folder.path().join("models.csv"), models).expect("a writable folder");
+    handful::study::report::write(folder.path(), folder.path()).expect("a study");
+    let tables = handful::study::tables::Tables::read(folder.path()).expect("a study");
+    let value = |method: &str, column: &str| tables.value("pole", method, column).expect("a column");
+    near("difference", value("pets", "sparc_minus_sac").expect("a number"), 1.0, 1e-12);
+    near("low", value("pets", "sparc_minus_sac_t_low").expect("an end"), 1.0 - 3.182_446 * 0.091_287, 1e-4);
+    near("of one", value("sac", "smoothness_sparc_t_high").expect("an end"), -3.15 + 3.182_446 * 0.064_550, 1e-4);
+    assert_eq!(value("sac", "sparc_minus_sac"), None);
+    let report = report_in(folder.path());
+    for part in [
+        "SPARC minus that of `sac`, with t intervals: `pets` +1.00 [+0.71, +1.29].",
+        "| method | error, 1 step | error, 5 steps | error, 15 steps | error, 25 steps | coverage, 1 step | coverage, 15 steps |",
+        "| pets | 0.35 [0.20, 0.50] | - | 1.50 [1.50, 1.50] | - | 0.75 [0.60, 0.90] | 0.50 [0.50, 0.50] |",
+    ] {
+        assert!(report.contains(part), "no `{part}` in: {report}");
+    }
+}
+
 /// A success rate of zero for everyone says nothing about which method is better.
 #[test]
 fn where_nothing_succeeds_returns_are_compared() {
     let folder = study_by_hand(&[("pets", &[0; 4], 0, [500, 1000]), ("sac", &[0; 4], 0, [500, 1000])]);
-    let rewrite = |table: &str, change: &dyn Fn(&[&str]) -> String| {
-        let path = folder.path().join(table);
-        let text = std::fs::read_to_string(&path).expect("a table");
-        let rows = text.lines().map(|line| change(&line.split(',').collect::<Vec<_>>()) + "\n");
-        std::fs::write(&path, rows.collect::<String>()).expect("a writable folder");
-    };
+    let rewrite = |table: &str, change: &dyn Fn(&[&str]) -> String| rewrite(&folder.path().join(table), change);
     rewrite("evaluations.csv", &|row| row.join(",") + if row[0] == "task" { ",return_mean" } else { ",-15.0" });
     // Seed 0 of `pets` has -10, seed 1 -11, and so on; those of `sac` have -20, -21.
     rewrite("tests.csv", &|row| match row[2].parse::<f64>() {
@@ -372,7 +491,7 @@ fn where_nothing_succeeds_returns_are_compared() {
     near("high", value("return_t_high"), -11.5 + 3.182_446 * (5.0_f64 / 12.0).sqrt(), 1e-4);
     let report = report_in(folder.path());
     for part in [
-        "Significantly higher test returns than `sac`: `pets`.",
+        "Significantly higher test returns than `sac`: `pets` (+10.0 [+",
         "`pets` has a mean test return of -11.5 (t interval [-13.6, -9.4]). Return from the same test starts, minus that of `sac`: +10.0 [",
     ] {
         assert!(report.contains(part), "no `{part}` in: {report}");

@@ -224,6 +224,11 @@ mod tests {
         let three = best(&returns, 3);
         assert_eq!(three, [1, 2, 4]);
         check(&three, &[0.419_229, 0.326_496, 0.254_275], [0.321_280, 0.394_829], [0.587_701, 0.209_096]);
-        assert_eq!(drawn(&[0.5, 0.3, 0.2], &[0.1, 1.2, 0.4]), 1);
+        // Scores of -0.593147, -0.003973 and -1.209438: the first is 0.589174 behind the second, and 0.616291 ahead of
+        // the third.
+        let with = |second: f64, third: f64| drawn(&[0.5, 0.3, 0.2], &[0.1, 1.2 - second, 0.4 + third]);
+        assert_eq!(with(0.0, 0.0), 1);
+        assert_eq!([with(0.589_16, 0.0), with(0.589_19, 0.0)], [1, 0]);
+        assert_eq!([with(1.0, 0.616_28), with(1.0, 0.616_31)], [0, 2]);
     }
 }

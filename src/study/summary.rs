@@ -29,6 +29,8 @@ struct Runs {
     /// For each seed, the expected return in its last evaluation, the one that followed, and the correlation of the two: NaN where one is
     /// not a number.
     expectations: [Vec<f64>; 3],
+    /// For each seed, the mean SPARC of its test episodes; empty if the tables do not tell it, or an episode has none.
+    sparc: Vec<f64>,
     /// Columns of the test whose mean is taken over all episodes.
     means: Vec<(&'static str, Option<f64>)>,
 }
@@ -59,6 +61,8 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
         }
         let success = lists(&rows, "success")?;
         let returns = lists(&rows, "return")?;
+        let sparc = if there.contains(&"sparc") { self::means(&lists(&rows, "sparc")?) } else { Vec::new() };
+        let sparc = if sparc.iter().all(|mean| mean.is_finite()) { sparc } else { Vec::new() };
         let over_steps = |column: &str| optional_curves(evaluations, &task, &method, column);
         let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
         let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
@@ -70,7 +74,19 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
             Ok(numbers(&at_the_end, column)?.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())
         };
         let expectations = [of_values("expected")?, of_values("realised")?, of_values("correlation")?];
-        all.push(Runs { task, method, success, returns, curves, clocks, action_ms, updates, expectations, means });
+        all.push(Runs {
+            task,
+            method,
+            success,
+            returns,
+            curves,
+            clocks,
+            action_ms,
+            updates,
+            expectations,
+            sparc,
+            means,
+        });
     }
     let names = |of: fn(&Runs) -> &String| all.iter().map(|runs| of(runs).clone()).collect::<Vec<String>>();
     let mut columns =
@@ -88,7 +104,7 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
 }
 
 /// The columns after task and method. Scripts read them by name: new ones are added at the end, none is removed.
-const SUMMARY: [&str; 51] = [
+const SUMMARY: [&str; 56] = [
     "seeds",
     "steps",
     "test_episodes",
@@ -140,6 +156,11 @@ const SUMMARY: [&str; 51] = [
     "return_minus_sac_high",
     "return_minus_sac_t_low",
     "return_minus_sac_t_high",
+    "smoothness_sparc_t_low",
+    "smoothness_sparc_t_high",
+    "sparc_minus_sac",
+    "sparc_minus_sac_t_low",
+    "sparc_minus_sac_t_high",
 ];
 
 /// The stream of every bootstrap: the tables alone decide its result.
@@ -204,6 +225,9 @@ impl Runs {
         if let Some([low, high]) = t_interval(&means(&self.returns)) {
             row.extend([("return_t_low", Some(low)), ("return_t_high", Some(high))]);
         }
+        if let Some([low, high]) = t_interval(&self.sparc) {
+            row.extend([("smoothness_sparc_t_low", Some(low)), ("smoothness_sparc_t_high", Some(high))]);
+        }
         if let Some(budget) = self.budget() {
             let times = self.times();
             let learners = all.iter().filter(|other| other.task == self.task && other.learns());
@@ -257,6 +281,10 @@ impl Runs {
         row.extend(entries.into_iter().zip([difference, low, high].map(Some)));
         if let Some(ends) = welch_interval(&means(&self.returns), &means(&baseline.returns)) {
             row.extend(["return_minus_sac_t_low", "return_minus_sac_t_high"].into_iter().zip(ends.map(Some)));
+        }
+        if let Some([low, high]) = welch_interval(&self.sparc, &baseline.sparc) {
+            let entries = ["sparc_minus_sac", "sparc_minus_sac_t_low", "sparc_minus_sac_t_high"];
+            row.extend(entries.into_iter().zip([mean(&self.sparc) - mean(&baseline.sparc), low, high].map(Some)));
         }
         for (entries, (probability, [low, high])) in [
             (

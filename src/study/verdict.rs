@@ -18,7 +18,9 @@ pub(super) fn verdict(tables: &Tables, tasks: &[&str]) -> Result<String> {
         text += &format!(
             "\nA difference is called significant if both methods have at least {SEEDS:.0} seeds and neither the 95 % bootstrap interval nor \
              the 95 % t interval includes equality. If `{BASELINE}` has censored seeds, the ratio of steps has no t interval, and the \
-             bootstrap interval decides alone. Nothing is corrected for the number of comparisons.\n"
+             bootstrap interval decides alone. Nothing is corrected for the number of comparisons. In parentheses: for \
+             steps, the mean of `{BASELINE}` divided by that of the method; otherwise the mean of the method minus that of `{BASELINE}`; in brackets \
+             the two intervals, at either end the wider one.\n"
         );
     }
     Ok(text)
@@ -116,6 +118,9 @@ struct Comparison {
     above: &'static str,
     /// The same, below it.
     below: &'static str,
+    /// How a value is written, and in what unit.
+    text: fn(f64) -> String,
+    unit: &'static str,
 }
 
 /// How the other methods compare with the baseline. An interval is the wider of the bootstrap's and Student's at either end.
@@ -124,16 +129,43 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
     let level = 100.0 * LEVEL;
     let comparisons = if tables.is_judged_by_return(task)? {
         let measure = "test returns".into();
-        vec![Comparison { column: "return_minus_sac", equal: 0.0, measure, above: "higher", below: "lower" }]
+        let text = |x| format!("{x:+.1}");
+        vec![Comparison {
+            column: "return_minus_sac",
+            equal: 0.0,
+            measure,
+            above: "higher",
+            below: "lower",
+            text,
+            unit: "",
+        }]
     } else {
         let steps = format!("steps to {level:.0} %");
         let success = "test success".into();
+        let times = |x| format!("{x:.1}");
+        let points = |x| format!("{:+.0}", 100.0 * x);
         vec![
-            Comparison { column: "sac_steps_ratio", equal: 1.0, measure: steps, above: "fewer", below: "more" },
-            Comparison { column: "success_minus_sac", equal: 0.0, measure: success, above: "more", below: "less" },
+            Comparison {
+                column: "sac_steps_ratio",
+                equal: 1.0,
+                measure: steps,
+                above: "fewer",
+                below: "more",
+                text: times,
+                unit: "",
+            },
+            Comparison {
+                column: "success_minus_sac",
+                equal: 0.0,
+                measure: success,
+                above: "more",
+                below: "less",
+                text: points,
+                unit: " percentage points",
+            },
         ]
     };
-    for Comparison { column, equal, measure, above, below } in comparisons {
+    for Comparison { column, equal, measure, above, below, text, unit } in comparisons {
         let [better, worse] = [above, below].map(|amount| format!("Significantly {amount} {measure} than"));
         let open = format!("No significant difference in {measure} from");
         let late = format!("Not every seed reaches {level:.0} % within its budget, so there is no ratio of steps to");
@@ -147,7 +179,8 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
                 let student = tables.value(task, method, &format!("{column}_t_{which}"))?;
                 Ok(bootstrap.map(|end| student.map_or(end, |other| of(end, other))))
             };
-            let group = match (end("low", f64::min)?, end("high", f64::max)?) {
+            let ends = (end("low", f64::min)?, end("high", f64::max)?);
+            let group = match ends {
                 (None, None) if count(method, "seeds_reaching_80")? < count(method, "seeds")? => 3,
                 (None, None) => 4,
                 _ if count(method, "seeds")?.min(count(BASELINE, "seeds")?) < SEEDS => 5,
@@ -155,7 +188,16 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
                 (_, Some(high)) if high < equal => 1,
                 _ => 2,
             };
-            groups[group].1.push(format!("`{method}`"));
+            let value = tables.value(task, method, column)?.map(text);
+            groups[group].1.push(match (group, value, ends) {
+                (0..=2, Some(value), (Some(low), Some(high))) => {
+                    format!("`{method}` ({value} [{}, {}]{unit})", text(low), text(high))
+                }
+                (0..=2, Some(value), (Some(low), None)) => {
+                    format!("`{method}` (at least {value}, interval from {}{unit})", text(low))
+                }
+                _ => format!("`{method}`"),
+            });
         }
         let found = groups.into_iter().filter(|(_, methods)| !methods.is_empty());
         let mut sentences: Vec<String> =
@@ -198,9 +240,20 @@ fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<
     }
     known.sort_by(|a, b| b.0.total_cmp(&a.0));
     let known: Vec<String> = known.iter().map(|(sparc, method, ldlj)| format!("`{method}` {sparc:.2}{ldlj}")).collect();
+    let mut differences = Vec::new();
+    for method in methods {
+        let value = |end: &str| tables.value(task, method, &format!("sparc_minus_sac{end}"));
+        if let (Some(difference), Some(low), Some(high)) = (value("")?, value("_t_low")?, value("_t_high")?) {
+            differences.push(format!("`{method}` {difference:+.2} [{low:+.2}, {high:+.2}]"));
+        }
+    }
+    let differences = match differences.as_slice() {
+        [] => String::new(),
+        _ => format!(" SPARC minus that of `{BASELINE}`, with t intervals: {}.", differences.join(", ")),
+    };
     Ok(Some(format!(
         "Smoothness of the hand's path in the test (SPARC, the smoothest first, and in brackets the log dimensionless jerk, which may order \
-         the methods differently; differences not tested for significance): {}.",
+         the methods differently): {}.{differences}",
         known.join(", ")
     )))
 }

@@ -46,6 +46,12 @@ mod tests {
     #[test]
     fn the_scale_is_the_references() {
         let values = [20.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0];
+        let mut sorted = values;
+        sorted.sort_by(f32::total_cmp);
+        for (share, expected) in [(0.05, 0.45), (0.95, 14.6)] {
+            let found = percentile(&sorted, share);
+            assert!((found - expected).abs() < 1e-5 * expected.max(1.0), "{found}, expected {expected}");
+        }
         let mut scale = RunningScale::default();
         for expected in [1.131_5, 1.261_685] {
             scale.update(&values);

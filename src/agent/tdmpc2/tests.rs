@@ -6,7 +6,7 @@ use crate::agent::Diagnostics;
 use crate::env::{Feature, Task};
 use crate::model::{EntropyBonus, ImplicitConfig};
 use crate::nn::two_hot::symexp;
-use crate::nn::{Parameters, TapeOps, Tensor3, device, ops, values, values_mut};
+use crate::nn::{Parameters, TapeOps, Tensor3, device, ops, tensor, values, values_mut};
 use crate::plan::GuidedConfig;
 use crate::replay::{Episode, SequenceBatch};
 
@@ -139,6 +139,34 @@ fn an_update_is_the_references() {
     near("policy", ops::mean(&loss.climb) + ops::mean(&loss.entropy), -0.000_994);
     let gradients = ops::total(tape, &[(1.0, loss.climb), (1.0, loss.entropy)]).backward();
     near("policy's gradient", norm(&gradients, policy.parameters().into_iter().map(|(_, p)| p)), 0.310_840);
+}
+
+/// The reference's values and entropies, row by row: untrained critics give every state the value that their bias says, and with an
+/// untrained policy, whose deviation is e^-4 for a state of zeros, the entropy follows from the noise.
+#[test]
+fn the_policys_loss_is_the_references() {
+    let spec = Spec::new("reference", [Feature::new("place")], 1, 100, 0.05);
+    let model = ImplicitConfig { bins: 3, bin_limit: 4.0, ..ImplicitConfig::default() };
+    let config = TdMpc2Config { model, ..TdMpc2Config::default() };
+    let mut networks = Networks::new(&spec, &config, &mut rng::stream(0, "policy's loss"));
+    let z = tensor(&device(), vec![0.0; 8 * config.model.latent], (1, 8, config.model.latent));
+    let entropies = [-3.0_f32, -1.0, -2.0, -2.0, 0.0, 1.0, 2.0, 4.0];
+    let noise = entropies.map(|nats| (2.0 * (nats + 4.0) - std::f32::consts::TAU.ln()).sqrt());
+    let (mut climb, mut entropy) = (0.0, 0.0);
+    for (row, q) in [10.0, 14.0, 11.0, 13.0, 9.0, 15.0, 12.0, 12.0].into_iter().enumerate() {
+        let (_, [middle, last]) = networks.model.bins().encode(q);
+        let logits = [-1e9, middle.ln(), last.ln()].repeat(2);
+        let biases = networks.model.parameters_mut().into_iter().filter(|(name, _)| name == "critics.2.bias");
+        biases.for_each(|(_, bias)| bias.copy_from(&logits));
+        // Values that are all alike move the scale towards 1: to 2.5.
+        let mut scale = RunningScale::new((2.5 - 0.01) / 0.99);
+        let loss = networks.climb(&mut OwnedTape::default(), &z, &noise, [0, 1], 2, &config, &mut scale);
+        climb += values(&loss.climb)[row] / 8.0;
+        entropy += values(&loss.entropy)[row] / 8.0;
+    }
+    assert!((climb + entropy + 2.249_937).abs() < 1e-5, "{climb} and {entropy}");
+    // Entropy is a small part of it.
+    assert!((entropy - 6.25e-5).abs() < 1e-9, "{entropy}");
 }
 
 /// Two slices of three steps, the second with the end of its task; by hand.

@@ -1,6 +1,8 @@
 use super::*;
-use crate::env::{Env, Task};
+use crate::env::{Env, Feature, Task};
+use crate::nn::two_hot::symexp;
 use crate::nn::{Parameters, ops, tensor, values, values_mut};
+use crate::replay::SequenceBatch;
 use crate::rng;
 
 /// Planning's fast path gives the returns of the model itself, for counts that fill no panel.
@@ -87,6 +89,55 @@ fn frozen_returns(residual: bool) {
     let expected = policy.sample_on(&mut NoneTape, &start, &first, EntropyBonus::Gaussian).0;
     for (found, expected) in proposed.iter().step_by(horizon).zip(values(&expected)) {
         assert!((found - expected).abs() < 1e-4, "{found}, expected {expected}");
+    }
+}
+
+/// The reference's losses of three time steps, in two slices that are alike. Untrained heads say the same of every state, so that
+/// their biases and the targets set the cross-entropies.
+#[test]
+fn later_steps_of_a_rollout_count_less() {
+    let spec = Spec::new("reference", [Feature::new("place")], 1, 100, 0.05);
+    let config = ImplicitConfig { bins: 5, bin_limit: 2.0, ..ImplicitConfig::default() };
+    let mut model = ImplicitModel::new(&spec, &config, &mut rng::stream(0, "losses"));
+    // Of the bins -1, 0 and 1, in symlog space. The outermost share the rest of the probability.
+    let logits = |losses: [f32; 3]| {
+        let [one, two, three] = losses.map(|loss| -loss);
+        let rest = (0.5 * (1.0 - one.exp() - two.exp() - three.exp())).ln();
+        [rest, one, two, three, rest]
+    };
+    for (name, parameter) in model.parameters_mut() {
+        match name.as_str() {
+            "reward.2.bias" => parameter.copy_from(&logits([1.2, 0.8, 3.0])),
+            "critics.2.bias" => parameter.copy_from(&[logits([4.0, 3.0, 2.0]), logits([4.4, 3.2, 2.2])].concat()),
+            _ => {}
+        }
+    }
+    let rows = |numbers: [f32; 3]| numbers.map(|x| [symexp(x); 2]).concat();
+    let batch = SequenceBatch {
+        sequences: 2,
+        length: 4,
+        obs: vec![0.3; 8],
+        actions: vec![0.5; 8],
+        // Halfway between two bins, the loss is the mean of theirs.
+        rewards: [vec![0.0; 2], rows([-1.0, -0.5, 0.0])].concat(),
+        ..SequenceBatch::default()
+    };
+    let loss = |encoded: Vec<f32>| {
+        let encoded = tensor(&device(), encoded, (1, 6, config.latent));
+        model.loss(&mut NoneTape, &batch, &encoded, &rows([-1.0, 0.0, 1.0]))
+    };
+    // The rollout does not depend on what it is compared with: states at these squared distances from it, per number.
+    let rollout = loss(vec![0.0; 6 * config.latent]).latents;
+    let beside = rollout[1..].iter().zip([0.004_f32, 0.003, 0.002]);
+    let beside = beside.flat_map(|(z, square)| values(z).iter().map(move |z| z + square.sqrt()));
+    let loss = loss(beside.collect());
+    for (found, expected) in [
+        (ops::mean(&loss.consistency), 0.002),
+        (ops::mean(&loss.reward), 0.633_333),
+        (ops::mean(&loss.value), 2.091_667),
+        (ops::total(NoneTape, &loss.weighted(&config)).array(), 0.312_5),
+    ] {
+        assert!((found - expected).abs() < 1e-5 * expected, "{found}, expected {expected}");
     }
 }
 

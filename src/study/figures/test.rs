@@ -8,7 +8,7 @@ use crate::error::Result;
 const BELOW: f64 = 0.25;
 
 /// The final test of every method on one task: the success rate of each seed (small dots, below), their mean with its 95 %
-/// interval from the summary, and smoothness of the hand if there is one.
+/// interval from the summary, and smoothness of the hand, if there is one, in the same way.
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -32,8 +32,13 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         let rates = seeds.iter().map(|episodes| (mean(episodes), y + BELOW));
         success = success.points("", rates.filter(|_| seeds.len() > 1)).coloured(*colour);
         if let Some(sparc) = value("smoothness_sparc")? {
+            let interval = [value("smoothness_sparc_t_low")?, value("smoothness_sparc_t_high")?];
+            smoothness = smoothness.line("", interval.into_iter().flatten().map(|end| (end, y))).coloured(*colour);
             smoothness = smoothness.dots("", [(sparc, y)]).coloured(*colour);
-            roughest = roughest.min(sparc);
+            let seeds = tables.smoothness(task, method)?;
+            let all = seeds.iter().map(|episodes| mean(episodes)).filter(|seed| seeds.len() > 1 && seed.is_finite());
+            roughest = all.clone().fold(roughest.min(sparc), f64::min);
+            smoothness = smoothness.points("", all.map(|seed| (seed, y + BELOW))).coloured(*colour);
         }
     }
     let mut panels = Panels::new(&format!("{task}: final test")).panel(success);

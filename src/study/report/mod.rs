@@ -1,5 +1,6 @@
 //! The report of a study, written from its tables alone.
 
+mod model;
 mod results;
 mod task;
 
@@ -57,6 +58,7 @@ pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String))
     }
     let mut text = format!("# Comparison on {}\n\n", tasks.join(", "));
     text += tuning_note(&tables)?;
+    text += QUESTION;
     let verdict = verdict(&tables, &tasks)?;
     if !verdict.is_empty() {
         text += &format!("## Verdict\n\n{verdict}\n");
@@ -97,6 +99,10 @@ pub fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
     tables.write(to)?;
     replays::join(folders, to)
 }
+
+const QUESTION: &str = "## Question\n\n\
+    How many environment steps does each method need to learn a task, how often does it succeed afterwards, and how smooth is its motion? \
+    Differences between methods count only as far as they exceed those between the seeds of one method.\n\n";
 
 /// What stands above the numbers of runs that served to choose settings.
 fn tuning_note(tables: &Tables) -> Result<&'static str> {

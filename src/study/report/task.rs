@@ -6,6 +6,7 @@ use super::super::figures;
 use super::super::replays::{self, Replay};
 use super::super::statistics::falls_below_again;
 use super::super::tables::{BASELINE, Curve, LEVEL, Tables};
+use super::model;
 use crate::error::Result;
 
 /// The findings, tables and figures of a task, whose methods may have been evaluated on grids that differ. The figures are
@@ -40,9 +41,10 @@ pub(super) fn section(tables: &Tables, task: &str, differ: bool, replays: &[Repl
     figures::tests(tables, task, &to.join(&file))?;
     figure(
         file,
-        "The test: success rate of each seed (small dots), their mean with its 95 % interval, and smoothness of the hand",
+        "The test: success rate and smoothness of the hand, of each seed (small dots), and their mean with its 95 % interval",
     );
     text += &replays::table(replays, task, &tables.methods(task)?);
+    text += &model::table(tables, task)?;
     for method in tables.methods(task)? {
         text += &diagnostics(tables, task, &method, to)?;
     }
@@ -58,13 +60,14 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
         let covered = !tables.model_curves(task, method, 1, "coverage90")?.is_empty();
         let coverage = if covered { ", and the coverage of its 90 % interval" } else { "" };
         text += &format!(
-            "![Open-loop prediction error of the model of {method} on the method's own evaluation episodes, in standard deviations of the \
+            "![Open-loop prediction error of the model of {method} on the method's own evaluation episodes (thin: each seed), in standard deviations of the \
              change (root mean square over features, median over start times; predicting no change has about 1){coverage}]({file})\n\n"
         );
     }
     let file = format!("{stem}-values.svg");
     if figures::values(tables, task, method, &to.join(&file))? {
-        text += &format!("![Return that {method} expected, and the return that followed]({file})\n\n");
+        text +=
+            &format!("![Return that {method} expected, and the return that followed (thin: each seed)]({file})\n\n");
     }
     let left_out = tables.left_out(task, method)?;
     if left_out > 0 {

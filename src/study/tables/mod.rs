@@ -218,6 +218,18 @@ impl Tables {
         found().map_err(inside)
     }
 
+    /// The SPARC of each test episode of a method, for each seed; empty if the tables do not tell it.
+    ///
+    /// # Errors
+    /// If a seed or an episode is named twice.
+    pub(super) fn smoothness(&self, task: &str, method: &str) -> Result<Vec<Vec<f64>>> {
+        if self.tests.column("sparc").is_err() {
+            return Ok(Vec::new());
+        }
+        let found = || lists(&by_run(of(&self.tests, task, method)?.lazy(), &["sparc"])?, "sparc");
+        found().map_err(inside)
+    }
+
     /// The return of an episode of a run's test, counted from 1; `None` if it is not in the tests.
     ///
     /// # Errors
