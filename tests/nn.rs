@@ -519,6 +519,21 @@ fn clipping_scales_the_whole_gradient() {
     near("step", before - values(module.parameters()[0].1)[0], clipped / (clipped + 1.0), 1e-4);
 }
 
+/// TD-MPC2's limit: a gradient of norm 50 is multiplied by 0.4.
+#[test]
+fn a_gradient_of_norm_50_is_clipped_to_20() {
+    let mut module = norm::RmsNorm::new(&device(), 2);
+    module.parameters_mut()[0].1.copy_from(&[0.0, 0.0]);
+    let mut gradients = dfdx::tensor::Gradients::leaky();
+    gradients.get_or_alloc_mut(module.parameters()[0].1).expect("memory").copy_from_slice(&[30.0, -40.0]);
+    let config = AdamConfig { max_norm: Some(20.0), epsilon: 1.0, ..AdamConfig::new(1.0) };
+    near("norm", Adam::new(config).step(&mut module, &mut gradients), 50.0, 1e-6);
+    // With epsilon 1, the first step is g / (|g| + 1).
+    let found = values(module.parameters()[0].1).to_vec();
+    near("step", -found[0], 12.0 / 13.0, 1e-5);
+    near("step", -found[1], -16.0 / 17.0, 1e-5);
+}
+
 #[test]
 fn a_group_lasso_shortens_the_weights_of_an_input() {
     let before = network(2, Norm::None, 5);
