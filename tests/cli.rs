@@ -47,11 +47,64 @@ fn a_study_does_not_replace_the_tables_of_another() {
     let debug = ["study", "--tasks", "pendulum", "--methods", "debug", "--seeds", "1", "--out", "own"];
     let output = handful(here, &debug);
     assert!(output.status.success(), "the folder of the first run is there");
-    assert!(text(&output.stderr).contains("own: 1 other complete run is there"), "{}", text(&output.stderr));
+    let left_out = "left out: own/pendulum/random/seed0 (it is a run that was not asked for";
+    assert!(text(&output.stderr).contains(left_out), "{}", text(&output.stderr));
     let weightless = ["export", "--run", "own/pendulum/random/seed0", "--out", "small"];
     refused(here, &weightless, &["own/pendulum/random/seed0", "random learns nothing"]);
     std::fs::remove_dir_all(here.join("own/pendulum/debug")).expect("a folder");
     refused(here, &study(&["--out", "own"]), &["own", other]);
+}
+
+/// Whole runs with another task, method or seed, a file, and folders that hold no run: none of them changes a number.
+#[test]
+fn what_else_lies_among_the_runs_is_left_out_by_name() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = folder.path();
+    let read = |file: &str| std::fs::read_to_string(here.join(file)).expect(file);
+    // Its report, and what it says.
+    let study = |tasks: &str, methods: &str, seeds: &str| {
+        let output = ["study", "--tasks", tasks, "--methods", methods, "--seeds", seeds, "--out", "study"];
+        let output = handful(here, &output);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        (read("study/report.md"), text(&output.stderr))
+    };
+    let tables =
+        || ["evaluations.csv", "tests.csv", "runs.csv", "summary.csv"].map(|file| read(&format!("study/{file}")));
+    let (report, _) = study("pendulum", "debug", "1");
+    let alone = tables();
+    assert!(report.contains("**yes**: every run that was found is included"), "{report}");
+    let (report, _) = study("pendulum,cartpole", "random,debug", "2");
+    assert!(report.contains("**yes**: every run that was found is included"), "{report}");
+    assert_ne!(tables(), alone);
+    // Tests of other runs where those of a run could be, and what macOS leaves in folders.
+    let foreign =
+        ["debug/test.csv", "debug/seed7/test.csv", "backup/seed0/test.csv", "../old/test.csv", "debug/.DS_Store"];
+    for file in foreign {
+        let to = here.join("study/pendulum").join(file);
+        std::fs::create_dir_all(to.parent().expect("a folder")).expect("a writable folder");
+        std::fs::copy(here.join("study/cartpole/random/seed0/test.csv"), to).expect("a test");
+    }
+    let (report, said) = study("pendulum", "debug", "1");
+    assert_eq!(tables(), alone);
+    assert!(report.contains("**no**: every run that was found is included. Exceptions: `"), "{report}");
+    let run = "it is a run that was not asked for; a study has those of the tasks, methods and seeds that are named";
+    let no_run = "it is no run, and was not read";
+    let expected = [
+        ("cartpole/debug/seed0", run),
+        ("cartpole/debug/seed1", run),
+        ("cartpole/random/seed0", run),
+        ("old", no_run),
+        ("pendulum/backup", no_run),
+        ("pendulum/debug/seed1", run),
+        ("pendulum/debug/seed7", no_run),
+        ("pendulum/debug/test.csv", no_run),
+        ("pendulum/random/seed0", run),
+    ];
+    for (other, reason) in expected {
+        assert!(report.contains(&format!("`study/{other}` (`{reason}`)")), "no `{other}` in: {report}");
+        assert!(said.contains(&format!("left out: study/{other} ({reason})")), "no `{other}` in: {said}");
+    }
+    assert_eq!(said.matches("left out: ").count(), expected.len(), "{said}");
 }
 
 /// Among the methods that nobody asked for.

@@ -12,10 +12,10 @@ use super::progress::Progress;
 use super::{note_long_warm_up, refuse_folder_of, stop_on_ctrl_c, whole};
 use crate::error::{Error, Result};
 use crate::study::config::RunConfig;
+#[cfg(feature = "study")]
+use crate::study::others::others_among;
 use crate::study::registry::Registry;
 use crate::study::run::check_run;
-#[cfg(feature = "study")]
-use crate::study::runner::other_complete_runs;
 use crate::study::runner::{self, Profile, StudyPlan};
 use crate::study::starts::Starts;
 use crate::study::status::{RunState, RunStatus, status, time_left};
@@ -196,17 +196,9 @@ fn seed_range(text: &str) -> Result<Range<u64>, String> {
 fn conclude(registry: &Registry, runs: &[(RunConfig, PathBuf)], folder: &Path, stop: &AtomicBool) -> Result<()> {
     // A run may have been begun there since.
     refuse_folder_of("run", "config.toml", folder)?;
-    let tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
+    let mut tables = crate::study::tables::Tables::gather(runs.iter().map(|(_, folder)| folder.as_path()))?;
+    tables.leave_out(others_among(folder, runs))?;
     tables.write(folder)?;
-    let others = other_complete_runs(folder, runs).len();
-    if others > 0 {
-        note(format_args!(
-            "{}: {others} other complete run{} not asked for, so the tables leave them out; to include them, name all tasks, \
-             methods and seeds",
-            folder.display(),
-            if others == 1 { " is there that was" } else { "s are there that were" }
-        ));
-    }
     for problem in crate::study::replays::record(registry, runs, folder, stop)? {
         note(format_args!("no replay: {problem}"));
     }

@@ -38,6 +38,8 @@ mod export;
 pub mod figures;
 mod folder;
 mod names;
+#[cfg(all(feature = "cli", feature = "study"))]
+pub(crate) mod others;
 #[cfg(feature = "study")]
 mod page;
 #[cfg(feature = "study")]

@@ -135,17 +135,6 @@ pub(crate) fn run_folder(study: &Path, task: &str, method: &str, seed: u64) -> P
     study.join(task).join(method).join(format!("seed{seed}"))
 }
 
-/// The complete runs in the folder of a study that are not among these.
-#[cfg(all(feature = "cli", feature = "study"))]
-pub(crate) fn other_complete_runs(study: &Path, runs: &[(RunConfig, PathBuf)]) -> Vec<PathBuf> {
-    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let there = inside(study.into()).flat_map(inside).flat_map(inside);
-    let others = there.filter(|folder| runs.iter().all(|(_, run)| run != folder));
-    let is_a_complete_run =
-        |folder: &PathBuf| super::folder::read_config(folder).is_ok_and(|(_, config)| is_complete(folder, &config));
-    others.filter(is_a_complete_run).collect()
-}
-
 /// Receives the progress of the runs; `&()` ignores it. Calls come from several threads.
 pub trait StudyObserver: Sync {
     /// A run begins, or goes on after `done` steps.

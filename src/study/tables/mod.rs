@@ -54,7 +54,7 @@ pub struct Tables {
     /// task, method, seed, version, configuration: one row per run, with the version of the program that made it, and its
     /// configuration as TOML. Studies of earlier versions do not have this table.
     pub runs: DataFrame,
-    /// run, reason: the runs, or their folders, that are in no table, and why.
+    /// run, reason: the runs, or their folders, that are in no table, and what else lies among them, and why.
     pub left_out: DataFrame,
     /// One row per task and method, computed from the other tables.
     pub summary: DataFrame,

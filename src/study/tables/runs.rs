@@ -5,6 +5,7 @@ use std::path::Path;
 
 use polars::prelude::*;
 
+use super::gather::left_out;
 use super::{Tables, inside, numbers, strings};
 use crate::agent::method_names;
 use crate::error::{Error, Result, shortened};
@@ -49,7 +50,7 @@ impl Tables {
         Ok(names.zip(texts).map(run).collect())
     }
 
-    /// The runs, or their folders, that are in no table, each with the reason.
+    /// The runs, or their folders, that are in no table, and what else lies among them, each with the reason.
     ///
     /// # Errors
     /// If the table lacks a column.
@@ -59,6 +60,17 @@ impl Tables {
         }
         let column = |name: &str| strings(&self.left_out, name).map_err(inside);
         Ok(column("run")?.into_iter().zip(column("reason")?).collect())
+    }
+
+    /// Adds to those what is in no table for another reason.
+    ///
+    /// # Errors
+    /// If the table of them lacks a column.
+    pub(crate) fn leave_out(&mut self, others: impl IntoIterator<Item = (String, String)>) -> Result<()> {
+        let mut missing = self.missing_runs()?;
+        missing.extend(others);
+        self.left_out = left_out(missing).map_err(inside)?;
+        Ok(())
     }
 
     /// Whether a method has the reward of a task as a function, or only the rewards that it receives: as its runs' configuration says,

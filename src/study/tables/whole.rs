@@ -6,7 +6,6 @@ use std::path::Path;
 use polars::prelude::*;
 
 use super::admission::{Admission, Candidate};
-use super::gather::left_out;
 use super::runs::{RunName, incomplete, row_names, run_names, said_of, settings};
 use super::{Tables, inside, numbers, strings};
 use crate::error::{Error, Result};
@@ -22,8 +21,6 @@ impl Tables {
         let Some((first, reason)) = objections.first() else { return Ok(()) };
         let (task, method, seed) = first;
         let problem = format!("no run can be reported; `{method}` on `{task}` with seed {seed}: {reason}");
-        let mut missing = self.missing_runs()?;
-        missing.extend(objections.iter().map(|(run, reason)| (said_of(folder, run), reason.clone())));
         let out: BTreeSet<&RunName> = objections.iter().map(|(run, _)| run).collect();
         let Self { evaluations, models, values, tests, runs, .. } = self;
         for table in [evaluations, models, values, tests, runs] {
@@ -32,8 +29,7 @@ impl Tables {
         if self.tests.height() == 0 {
             return Err(Error::data(folder)(problem));
         }
-        self.left_out = left_out(missing).map_err(inside)?;
-        Ok(())
+        self.leave_out(objections.iter().map(|(run, reason)| (said_of(folder, run), reason.clone())))
     }
 
     /// The runs to leave out, each with the reason.
