@@ -143,7 +143,7 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
         let steps = format!("steps to {level:.0} %");
         let success = "test success".into();
         let times = |x| format!("{x:.1}");
-        let points = |x| format!("{:+.0}", 100.0 * x);
+        let points = |x: f64| format!("{:+.0}", (100.0 * x).round() + 0.0);
         vec![
             Comparison {
                 column: "sac_steps_ratio",
