@@ -29,7 +29,7 @@ struct Runs {
     /// For each seed, the expected return in its last evaluation, the one that followed, and the correlation of the two: NaN where one is
     /// not a number.
     expectations: [Vec<f64>; 3],
-    /// For each seed, the mean SPARC of its test episodes; empty if the tables do not tell it, or an episode has none.
+    /// For each seed, the mean SPARC of its test episodes (NaN if none has one); empty if the tables do not tell it.
     sparc: Vec<f64>,
     /// Columns of the test whose mean is taken over all episodes.
     means: Vec<(&'static str, Option<f64>)>,
@@ -62,7 +62,6 @@ pub(super) fn summarise(evaluations: &DataFrame, values: &DataFrame, tests: &Dat
         let success = lists(&rows, "success")?;
         let returns = lists(&rows, "return")?;
         let sparc = if there.contains(&"sparc") { self::means(&lists(&rows, "sparc")?) } else { Vec::new() };
-        let sparc = if sparc.iter().all(|mean| mean.is_finite()) { sparc } else { Vec::new() };
         let over_steps = |column: &str| optional_curves(evaluations, &task, &method, column);
         let [curves, clocks] = [over_steps("success")?, over_steps("seconds")?];
         let [action_ms, updates] = [over_steps("action_ms")?, over_steps("updates")?];
@@ -222,11 +221,11 @@ impl Runs {
             let [low, high] = ends.map(|end| Some(end.clamp(0.0, 1.0)));
             row.extend([("success_t_low", low), ("success_t_high", high)]);
         }
-        if let Some([low, high]) = t_interval(&means(&self.returns)) {
-            row.extend([("return_t_low", Some(low)), ("return_t_high", Some(high))]);
-        }
-        if let Some([low, high]) = t_interval(&self.sparc) {
-            row.extend([("smoothness_sparc_t_low", Some(low)), ("smoothness_sparc_t_high", Some(high))]);
+        for (ends, seeds) in [
+            (["return_t_low", "return_t_high"], &means(&self.returns)),
+            (["smoothness_sparc_t_low", "smoothness_sparc_t_high"], &self.sparc),
+        ] {
+            row.extend(ends.into_iter().zip(t_interval(seeds).into_iter().flatten().map(Some)));
         }
         if let Some(budget) = self.budget() {
             let times = self.times();
@@ -252,10 +251,8 @@ impl Runs {
                 ("area_under_curve", Some(mean(&areas))),
                 ("common_budget", Some(common)),
             ]);
-            if let Some([low, high]) = t_interval(&areas) {
-                let [low, high] = [low, high].map(|end| Some(end.clamp(0.0, 1.0)));
-                row.extend([("area_under_curve_t_low", low), ("area_under_curve_t_high", high)]);
-            }
+            let ends = t_interval(&areas).into_iter().flatten().map(|end| Some(end.clamp(0.0, 1.0)));
+            row.extend(["area_under_curve_t_low", "area_under_curve_t_high"].into_iter().zip(ends));
             let is_baseline = |other: &&Self| other.task == self.task && other.method == BASELINE && other.learns();
             if let Some(baseline) = all.iter().find(is_baseline).filter(|_| self.method != BASELINE) {
                 row.extend(self.against(baseline));
