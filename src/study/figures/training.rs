@@ -70,8 +70,9 @@ pub fn values(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<
         .between(low, high)
         .y_ticks(11, if high - low < 10.0 { tenths } else { whole });
     let correlation = [(PALETTE[2], "over time steps".to_string(), correlation)];
+    let lowest = drawn(&correlation).fold(-0.3, f64::min);
     let correlation =
-        over_training("correlation of the two", &correlation).between(-0.3, 1.03).y_ticks(11, tenths).mark(1.0);
+        over_training("correlation of the two", &correlation).between(lowest, 1.03).y_ticks(11, tenths).mark(1.0);
     let title = format!("{task}: return that {method} expected, and the return that followed (thin: each seed)");
     save(&Panels::new(&title).panel(means).panel(correlation), path)?;
     Ok(true)
