@@ -324,7 +324,10 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         .map(|column| ["pets", "pets-learned", "sac", "tdmpc2", "dreamer"].map(|method| push(method, column)));
     assert_eq!((seeds, reaching), ([5.0; 5], [5.0, 5.0, 5.0, 4.0, 5.0]));
     let of_seeds = listed(&test_successes("push", "push", "pets-learned"));
-    quotes.push(("README.md", format!("it succeeds in {of_seeds} of 100 test episodes")));
+    quotes.extend([
+        ("README.md", format!("it succeeds in {of_seeds} of 100 test episodes")),
+        ("chapters/06-pets.md", format!("succeed in {of_seeds} of 100 test episodes after 20,000")),
+    ]);
     let difference = |method: &str| {
         let [low, high] =
             ["success_minus_sac_t_low", "success_minus_sac_t_high"].map(|column| 100.0 * push(method, column));
