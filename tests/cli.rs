@@ -47,7 +47,7 @@ fn a_study_does_not_replace_the_tables_of_another() {
     let debug = ["study", "--tasks", "pendulum", "--methods", "debug", "--seeds", "1", "--out", "own"];
     let output = handful(here, &debug);
     assert!(output.status.success(), "the folder of the first run is there");
-    let left_out = "left out: own/pendulum/random/seed0 (it is a run that was not asked for";
+    let left_out = "left out: own/pendulum/random/seed0 (this command did not ask for it";
     assert!(text(&output.stderr).contains(left_out), "{}", text(&output.stderr));
     let weightless = ["export", "--run", "own/pendulum/random/seed0", "--out", "small"];
     refused(here, &weightless, &["own/pendulum/random/seed0", "random learns nothing"]);
@@ -72,9 +72,9 @@ fn what_else_lies_among_the_runs_is_left_out_by_name() {
         || ["evaluations.csv", "tests.csv", "runs.csv", "summary.csv"].map(|file| read(&format!("study/{file}")));
     let (report, _) = study("pendulum", "debug", "1");
     let alone = tables();
-    assert!(report.contains("**yes**: every run that was found is included"), "{report}");
+    assert!(report.contains("**yes**: everything that was found among the runs is included"), "{report}");
     let (report, _) = study("pendulum,cartpole", "random,debug", "2");
-    assert!(report.contains("**yes**: every run that was found is included"), "{report}");
+    assert!(report.contains("**yes**: everything that was found among the runs is included"), "{report}");
     assert_ne!(tables(), alone);
     // Tests of other runs where those of a run could be, and what macOS leaves in folders.
     let foreign =
@@ -86,9 +86,9 @@ fn what_else_lies_among_the_runs_is_left_out_by_name() {
     }
     let (report, said) = study("pendulum", "debug", "1");
     assert_eq!(tables(), alone);
-    assert!(report.contains("**no**: every run that was found is included. Exceptions: `"), "{report}");
-    let run = "it is a run that was not asked for; a study has those of the tasks, methods and seeds that are named";
-    let no_run = "it is no run, and was not read";
+    assert!(report.contains("**no**: everything that was found among the runs is included. Exceptions: `"), "{report}");
+    let run = "this command did not ask for it; to include it, name its task, method and seed";
+    let no_run = "it is not a run, and was not read";
     let expected = [
         ("cartpole/debug/seed0", run),
         ("cartpole/debug/seed1", run),

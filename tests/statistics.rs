@@ -460,7 +460,7 @@ fn smoothness_and_model_errors_stand_in_the_report() {
     assert_eq!(value("sac", "sparc_minus_sac"), None);
     let report = report_in(folder.path());
     for part in [
-        "SPARC minus that of `sac`, with t intervals: `pets` +1.00 [+0.71, +1.29].",
+        "SPARC minus that of `sac`, with t intervals that are not corrected for their number: `pets` +1.00 [+0.71, +1.29].",
         "| method | error, 1 step | error, 5 steps | error, 15 steps | error, 25 steps | coverage, 1 step | coverage, 15 steps |",
         "| pets | 0.35 [0.20, 0.50] | - | 1.50 [1.50, 1.50] | - | 0.75 [0.60, 0.90] | 0.50 [0.50, 0.50] |",
     ] {

@@ -11,9 +11,8 @@ use super::replays;
 const LEVELS: usize = 3;
 
 /// Why something is left out.
-const NOT_ASKED_FOR: &str =
-    "it is a run that was not asked for; a study has those of the tasks, methods and seeds that are named";
-const NO_RUN: &str = "it is no run, and was not read";
+const NOT_ASKED_FOR: &str = "this command did not ask for it; to include it, name its task, method and seed";
+const NO_RUN: &str = "it is not a run, and was not read";
 
 /// What lies among the runs of a study and is none of them, each with the reason why it is left out: other runs, and what is no run. Hidden
 /// files do not count, since systems leave them in every folder, and neither does what the study itself writes.

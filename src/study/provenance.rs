@@ -50,7 +50,7 @@ pub(super) fn checklist(tables: &Tables, different_grids: &[&str]) -> Result<Str
     }
     item("each learning method of a task has at least five seeds", &few);
     item("all learning methods of a task have the same seeds", &missing);
-    item("every run that was found is included", &left_out(tables)?);
+    item("everything that was found among the runs is included", &left_out(tables)?);
     item(
         "all learning methods of a task are trained for the same number of steps",
         &different_budgets(tables, of_tasks.keys())?,

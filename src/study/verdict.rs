@@ -18,9 +18,9 @@ pub(super) fn verdict(tables: &Tables, tasks: &[&str]) -> Result<String> {
         text += &format!(
             "\nA difference is called significant if both methods have at least {SEEDS:.0} seeds and neither the 95 % bootstrap interval nor \
              the 95 % t interval includes equality. If `{BASELINE}` has censored seeds, the ratio of steps has no t interval, and the \
-             bootstrap interval decides alone. Nothing is corrected for the number of comparisons. In parentheses: for \
-             steps, the mean of `{BASELINE}` divided by that of the method; otherwise the mean of the method minus that of `{BASELINE}`; in brackets \
-             the two intervals, at either end the wider one.\n"
+             bootstrap interval decides alone. Nothing is corrected for the number of comparisons. In parentheses, \
+             for steps: how many times as many steps `{BASELINE}` needs on average; otherwise the method's mean minus that of `{BASELINE}`. In \
+             brackets: the smallest interval that contains both intervals.\n"
         );
     }
     Ok(text)
@@ -129,7 +129,7 @@ fn beside_the_baseline(tables: &Tables, task: &str, learning: &[&str]) -> Result
     let level = 100.0 * LEVEL;
     let comparisons = if tables.is_judged_by_return(task)? {
         let measure = "test returns".into();
-        let text = |x| format!("{x:+.1}");
+        let text = |x: f64| format!("{:+.1}", (10.0 * x).round() / 10.0 + 0.0);
         vec![Comparison {
             column: "return_minus_sac",
             equal: 0.0,
@@ -240,16 +240,23 @@ fn smoothness(tables: &Tables, task: &str, methods: &[String]) -> Result<Option<
     }
     known.sort_by(|a, b| b.0.total_cmp(&a.0));
     let known: Vec<String> = known.iter().map(|(sparc, method, ldlj)| format!("`{method}` {sparc:.2}{ldlj}")).collect();
+    let seeds = |method: &str| tables.value(task, method, "seeds").map(|seeds| seeds.unwrap_or(0.0));
     let mut differences = Vec::new();
     for method in methods {
         let value = |end: &str| tables.value(task, method, &format!("sparc_minus_sac{end}"));
-        if let (Some(difference), Some(low), Some(high)) = (value("")?, value("_t_low")?, value("_t_high")?) {
+        let ends = (value("")?, value("_t_low")?, value("_t_high")?);
+        if let (Some(difference), Some(low), Some(high)) = ends
+            && seeds(method)?.min(seeds(BASELINE)?) >= SEEDS
+        {
             differences.push(format!("`{method}` {difference:+.2} [{low:+.2}, {high:+.2}]"));
         }
     }
     let differences = match differences.as_slice() {
         [] => String::new(),
-        _ => format!(" SPARC minus that of `{BASELINE}`, with t intervals: {}.", differences.join(", ")),
+        _ => format!(
+            " SPARC minus that of `{BASELINE}`, with t intervals that are not corrected for their number: {}.",
+            differences.join(", ")
+        ),
     };
     Ok(Some(format!(
         "Smoothness of the hand's path in the test (SPARC, the smoothest first, and in brackets the log dimensionless jerk, which may order \

@@ -211,7 +211,7 @@ fn runs_that_cannot_be_used_are_left_out_by_name() {
     assert_eq!(configurations[1].configuration.trim(), written.trim());
     let report = fs::read_to_string(study.join("report.md")).expect("a report");
     for part in [
-        "**no**: every run that was found is included. Exceptions: `",
+        "**no**: everything that was found among the runs is included. Exceptions: `",
         "seed1/test.csv: it was lost or changed after the run had ended",
         "with seed 3 has another configuration than with seed 0 (its  evaluation_episodes  is ",
         "with seed 0 is there twice",

@@ -95,7 +95,8 @@ fn a_run_that_is_not_whole_is_left_out_by_name() {
         report::write(folder.path(), folder.path()).expect("a report");
         let text = fs::read_to_string(folder.path().join("report.md")).expect("a report");
         assert!(
-            text.contains("**no**: every run that was found is included. Exceptions: `") && text.contains("seed 1"),
+            text.contains("**no**: everything that was found among the runs is included. Exceptions: `")
+                && text.contains("seed 1"),
             "{text}"
         );
         // It does not come back in a joined study.

@@ -8,7 +8,7 @@ use crate::error::Result;
 const BELOW: f64 = 0.25;
 
 /// The final test of every method on one task: the success rate of each seed (small dots, below), their mean with its 95 %
-/// interval from the summary, and smoothness of the hand, if there is one, in the same way.
+/// interval from the summary, and smoothness of the hand, if there is one, in the same way (with a t interval).
 ///
 /// # Errors
 /// If the tables lack a column or the file cannot be written.
@@ -33,6 +33,7 @@ pub fn tests(tables: &Tables, task: &str, path: &Path) -> Result<()> {
         success = success.points("", rates.filter(|_| seeds.len() > 1)).coloured(*colour);
         if let Some(sparc) = value("smoothness_sparc")? {
             let interval = [value("smoothness_sparc_t_low")?, value("smoothness_sparc_t_high")?];
+            roughest = interval.into_iter().flatten().fold(roughest, f64::min);
             smoothness = smoothness.line("", interval.into_iter().flatten().map(|end| (end, y))).coloured(*colour);
             smoothness = smoothness.dots("", [(sparc, y)]).coloured(*colour);
             let seeds = tables.smoothness(task, method)?;

@@ -58,7 +58,7 @@ pub(crate) fn write_noting(from: &Path, to: &Path, note: &mut dyn FnMut(String))
     }
     let mut text = format!("# Comparison on {}\n\n", tasks.join(", "));
     text += tuning_note(&tables)?;
-    text += QUESTION;
+    text += &question(&tables, &pairs)?;
     let verdict = verdict(&tables, &tasks)?;
     if !verdict.is_empty() {
         text += &format!("## Verdict\n\n{verdict}\n");
@@ -100,9 +100,20 @@ pub fn join(folders: &[PathBuf], to: &Path) -> Result<Vec<String>> {
     replays::join(folders, to)
 }
 
-const QUESTION: &str = "## Question\n\n\
-    How many environment steps does each method need to learn a task, how often does it succeed afterwards, and how smooth is its motion? \
-    Differences between methods count only as far as they exceed those between the seeds of one method.\n\n";
+/// What the study asks.
+fn question(tables: &Tables, pairs: &[(String, String)]) -> Result<String> {
+    let any = |column: &str| -> Result<bool> {
+        let of = |(task, method): &(String, String)| Ok(tables.value(task, method, column)?.is_some());
+        pairs.iter().map(of).try_fold(false, |any, there| Ok(any | there?))
+    };
+    let learned = any("steps")?;
+    let mut asked =
+        Vec::from_iter(learned.then_some("How many environment steps does each method need to learn a task? "));
+    asked.push(if learned { "How often does it succeed afterwards?" } else { "How often does each method succeed?" });
+    asked.extend(any("smoothness_sparc")?.then_some(" How smooth is its motion?"));
+    asked.extend(learned.then_some(" Seeds of one method differ, too, so differences have intervals over seeds."));
+    Ok(format!("## Question\n\n{}\n\n", asked.concat()))
+}
 
 /// What stands above the numbers of runs that served to choose settings.
 fn tuning_note(tables: &Tables) -> Result<&'static str> {

@@ -221,7 +221,7 @@ impl Tables {
     /// The SPARC of each test episode of a method, for each seed; empty if the tables do not tell it.
     ///
     /// # Errors
-    /// If a seed or an episode is named twice.
+    /// If the table lacks a column.
     pub(super) fn smoothness(&self, task: &str, method: &str) -> Result<Vec<Vec<f64>>> {
         if self.tests.column("sparc").is_err() {
             return Ok(Vec::new());
