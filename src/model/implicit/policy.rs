@@ -148,7 +148,7 @@ mod tests {
         near(&[squashed], &[-2.0 * 0.788_510]);
         // The published code of 2023 does not double the correction, and counts the density's constant, ln(2 pi) / 2, for one
         // action instead of two before it doubles that. We have no such bonus, but its parts are those of ours.
-        near(&[gaussian - std::f32::consts::TAU.ln() + (squashed - gaussian) / 2.0], &[-1.503_510]);
+        near(&[gaussian - std::f32::consts::TAU.ln() + (squashed - gaussian) / 2.0], &[-1.503_51]);
     }
 
     #[test]
