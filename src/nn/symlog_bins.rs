@@ -179,8 +179,6 @@ mod tests {
                 assert!((decoded - back).abs() < 2e-5 * back.abs().max(1.0), "{x}: {decoded}, expected {back}");
             }
         }
-        // Beyond the outermost bins, all the weight lies on them.
-        assert_eq!([30_000.0, -30_000.0].map(|x| bins.encode(x)), [(99, [0.0, 1.0]), (0, [1.0, 0.0])]);
         assert!(bins.contains(-22_000.0) && !bins.contains(22_100.0));
         assert!(bins.encode(f32::NAN).1[0].is_nan());
         let logits = (0..101).map(|k| -((k - 55) as f32).powi(2) / 8.0).collect();
