@@ -22,7 +22,7 @@ pub(crate) fn others_among(study: &Path, runs: &[(RunConfig, PathBuf)]) -> Vec<(
     others.map(|(path, reason)| (path.display().to_string(), reason.into())).collect()
 }
 
-/// The same in a folder that is so many levels above runs. `ours` are the study's runs and the folders around them.
+/// The same in a directory that is `levels` above the run directories. `ours` are the study's run directories and their ancestors.
 fn others_in(folder: &Path, levels: usize, ours: &BTreeSet<&Path>) -> Vec<(PathBuf, &'static str)> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let shown = entries.filter(|entry| !entry.file_name().to_string_lossy().starts_with('.'));
