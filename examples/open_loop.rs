@@ -3,15 +3,16 @@
 //! `TASK.svg`.
 //!
 //! `cargo run --example open_loop` (a few minutes); with names of tasks as arguments, only those;
-//! with `-- draw`, only the figures, from the tables that are there.
+//! with `-- draw`, only the figures, from the tables that are there; with `-- calibration`, instead of all this, how well the
+//! uncertainty of ensembles is calibrated that is propagated in different ways: `data/open_loop/calibration.csv`.
 
 use std::error::Error;
 use std::path::Path;
 
 use handful::agent::{DreamerConfig, Preset};
-use handful::chart::Chart;
+use handful::chart::{Chart, PALETTE, Panels};
 use handful::env::{Env, Spec, Task, World};
-use handful::model::open_loop::{OpenLoopModel, Propagated, open_loop};
+use handful::model::open_loop::{HORIZONS, OpenLoopModel, Propagated, open_loop};
 use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, Propagation, WorldModel};
 use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
@@ -25,6 +26,8 @@ const TRAINING: u64 = 60;
 const HELD_OUT: u64 = 20;
 /// Gradient steps of each model.
 const STEPS: usize = 4000;
+/// Ensembles whose calibration is measured, for each task.
+const SEEDS: u64 = 5;
 /// Weight of the scripted policy's action, for one episode after the other; noise has 1.2 minus that.
 const POLICY_WEIGHTS: [f64; 3] = [1.0, 0.7, 0.0];
 
@@ -98,6 +101,10 @@ fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episode
     }
 }
 
+fn ensemble_config() -> EnsembleConfig {
+    EnsembleConfig { hidden: vec![200, 200], first_steps: STEPS, ..EnsembleConfig::default() }
+}
+
 fn compare(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let mut rng = rng::stream(0, "foresight");
     let training = record(task, 0..TRAINING, &mut rng)?;
@@ -107,8 +114,7 @@ fn compare(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let spec = world.spec();
     let mut rows = Vec::new();
 
-    let config = EnsembleConfig { hidden: vec![200, 200], first_steps: STEPS, ..EnsembleConfig::default() };
-    let mut ensemble = Ensemble::new(spec, config, &mut rng)?;
+    let mut ensemble = Ensemble::new(spec, ensemble_config(), &mut rng)?;
     ensemble.fit(&training.transitions, &mut rng);
     let dynamics = &ensemble.dynamics();
     evaluate("ensemble", &Propagated { dynamics, propagation: Propagation::TsInf }, spec, &held_out, &mut rows);
@@ -136,6 +142,87 @@ fn compare(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     draw(task, folder)
 }
 
+/// Ways of propagating uncertainty, and their names in the figure. `Expectation` predicts one trajectory and no uncertainty.
+const PROPAGATIONS: [(Propagation, &str); 5] = [
+    (Propagation::TsInf, "TS-inf"),
+    (Propagation::Ts1, "TS1"),
+    (Propagation::MomentMatching, "moment matching"),
+    (Propagation::TsInfMean, "TS-inf, means only"),
+    (Propagation::Expectation, "expectation"),
+];
+
+/// A row of `calibration.csv`.
+#[derive(serde::Deserialize, serde::Serialize)]
+struct CalibrationRow {
+    task: String,
+    propagation: Propagation,
+    seed: u64,
+    horizon: usize,
+    rmse: f64,
+    nll: Option<f64>,
+    coverage90: Option<f64>,
+}
+
+/// Ensembles of five seeds, each trained on its own episodes, whose uncertainty is propagated in every way.
+fn calibrate(task: Task, writer: &mut csv::Writer<std::fs::File>) -> Result<(), Box<dyn Error>> {
+    let world = task.make();
+    let spec = world.spec();
+    for seed in 0..SEEDS {
+        let mut rng = rng::stream(seed, "calibration");
+        let training = record(task, 100 * seed..100 * seed + TRAINING, &mut rng)?;
+        let held_out = record(task, 1000..1000 + HELD_OUT, &mut rng)?.episodes;
+        let mut ensemble = Ensemble::new(spec, ensemble_config(), &mut rng)?;
+        ensemble.fit(&training.transitions, &mut rng);
+        let dynamics = &ensemble.dynamics();
+        for (propagation, _) in PROPAGATIONS {
+            for row in open_loop(&Propagated { dynamics, propagation }, spec, &held_out, &mut rng::stream(0, "judge")) {
+                let (horizon, rmse, nll, coverage90) = (row.horizon, row.rmse, row.nll, row.coverage90);
+                writer.serialize(CalibrationRow {
+                    task: task.name().into(),
+                    propagation,
+                    seed,
+                    horizon,
+                    rmse,
+                    nll,
+                    coverage90,
+                })?;
+            }
+        }
+        println!("{task}, seed {seed}");
+    }
+    Ok(writer.flush()?)
+}
+
+/// Draws `calibration.csv`: a panel for each task, thin lines for seeds.
+fn draw_calibration(folder: &Path) -> Result<(), Box<dyn Error>> {
+    let table = csv::Reader::from_path(folder.join("calibration.csv"))?;
+    let rows = table.into_deserialize().collect::<Result<Vec<CalibrationRow>, _>>()?;
+    let panel = |task: Task| {
+        let chart = Chart::new("time steps ahead, open loop", "coverage of the 90 % interval")
+            .titled(task.name())
+            .between(0.0, 1.0)
+            .mark(0.9)
+            .legend(SeriesLabelPosition::LowerRight);
+        PALETTE.into_iter().zip(&PROPAGATIONS[..4]).fold(chart, |chart, (colour, (propagation, name))| {
+            let of_way = || rows.iter().filter(|row| row.task == task.name() && row.propagation == *propagation);
+            let curve = |seed: u64| {
+                let of_seed = of_way().filter(move |row| row.seed == seed);
+                of_seed.filter_map(|row| Some((row.horizon as f64, row.coverage90?))).collect::<Vec<_>>()
+            };
+            let chart = (0..SEEDS).fold(chart, |chart, seed| chart.thin(curve(seed)).coloured(colour));
+            let mean = HORIZONS.map(|horizon| {
+                let of_seeds = of_way().filter(|row| row.horizon == horizon).filter_map(|row| row.coverage90);
+                (horizon as f64, of_seeds.sum::<f64>() / SEEDS as f64)
+            });
+            chart.line(name, mean).coloured(colour)
+        })
+    };
+    let panels = [Task::Reach, Task::Lift, Task::Push].into_iter().map(panel);
+    let title = "Calibration of an ensemble's uncertainty (thin: each seed)";
+    std::fs::write(folder.join("calibration.svg"), panels.fold(Panels::new(title), Panels::panel).svg()?)?;
+    Ok(())
+}
+
 /// Draws `TASK.csv`.
 fn draw(task: Task, folder: &Path) -> Result<(), Box<dyn Error>> {
     let table = csv::Reader::from_path(folder.join(format!("{}.csv", task.name())))?;
@@ -159,8 +246,17 @@ fn chart(task: Task, rows: &[Row]) -> Chart {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let folder = Path::new("data/open_loop");
-    if std::env::args().nth(1).as_deref() == Some("draw") {
-        return [Task::Reach, Task::Push].into_iter().try_for_each(|task| draw(task, folder));
+    match std::env::args().nth(1).as_deref() {
+        Some("draw") => {
+            draw_calibration(folder)?;
+            return [Task::Reach, Task::Push].into_iter().try_for_each(|task| draw(task, folder));
+        }
+        Some("calibration") => {
+            let mut writer = csv::Writer::from_path(folder.join("calibration.csv"))?;
+            [Task::Reach, Task::Lift, Task::Push].into_iter().try_for_each(|task| calibrate(task, &mut writer))?;
+            return draw_calibration(folder);
+        }
+        _ => {}
     }
     let named: Result<Vec<Task>, _> = std::env::args().skip(1).map(|name| name.parse()).collect();
     let tasks = Some(named?).filter(|tasks| !tasks.is_empty()).unwrap_or_else(|| vec![Task::Reach, Task::Push]);

@@ -217,6 +217,60 @@ fn the_fingers_move_as_in_robosuite() {
 }
 
 #[derive(Deserialize)]
+struct HeldOutPaths {
+    path: Vec<HeldOutPath>,
+}
+
+#[derive(Deserialize)]
+struct HeldOutPath {
+    /// Translation and gripper's component of an action, then hand x, y, z and position of a finger.
+    steps: Vec<[f64; 8]>,
+}
+
+/// Four paths of 120 control steps that served for nothing else.
+#[test]
+fn the_hand_follows_unseen_paths_of_robosuite() {
+    let text = include_str!("../data/reference/paths.toml");
+    let reference: HeldOutPaths = toml::from_str(text).expect("the reference file is well-formed");
+    let arm = ArmDescription::panda();
+    let gripper = &arm.gripper;
+    let (mut hand, mut finger) = (Vec::new(), Vec::new());
+    for path in reference.path {
+        let mut physics = Physics::new(arm.clone());
+        physics.set_joints(&arm.home, [gripper.start; 2]);
+        let mut measured = physics.kinematics(&arm.home).grip;
+        let goal = Goal { position: measured.translation.vector, orientation: measured.rotation };
+        let mut controller = OperationalSpaceController::new(&arm, goal, arm.home);
+        let mut opening = gripper.start;
+        for [dx, dy, dz, closes, x, y, z, theirs] in path.steps {
+            controller.goal = Goal {
+                position: measured.translation.vector + 0.05 * Vector3::new(dx, dy, dz),
+                orientation: measured.rotation,
+            };
+            opening = (opening - closes * gripper.target_step).clamp(0.0, 0.04);
+            for _ in 0..STEPS_PER_CONTROL {
+                let joints = physics.joint_state();
+                let at = physics.kinematics(&joints.q);
+                measured = at.grip;
+                let servo = |q: f64| (gripper.stiffness * (opening - q)).clamp(-gripper.max_force, gripper.max_force);
+                physics.step(&controller.torques(&at, &joints.q, &joints.qd), joints.fingers.map(servo));
+            }
+            let now = physics.joint_state();
+            let grip = physics.kinematics(&now.q).grip.translation.vector;
+            hand.push((grip - Vector3::new(x, y, z)).norm() * 1e3);
+            finger.push((now.fingers[0] - theirs).abs() * 1e3);
+        }
+    }
+    let [[hand_median, hand_worst], [finger_median, finger_worst]] = [hand, finger].map(|mut errors| {
+        errors.sort_by(f64::total_cmp);
+        [errors[errors.len() / 2], errors[errors.len() - 1]]
+    });
+    println!("hand {hand_median:.2} mm, at most {hand_worst:.2}; finger {finger_median:.2}, at most {finger_worst:.2}");
+    assert!(hand_median < 4.0 && hand_worst < 7.5, "hand: {hand_median} mm, at most {hand_worst}");
+    assert!(finger_median < 0.6 && finger_worst < 1.5, "finger: {finger_median} mm, at most {finger_worst}");
+}
+
+#[derive(Deserialize)]
 struct DoorReference {
     episode: Vec<DoorEpisode>,
 }

@@ -623,10 +623,10 @@ fn a_plan_limits_the_budget_of_its_runs() {
         let grid = |c: &RunConfig| [c.steps, c.evaluate_every, c.evaluation_episodes, c.test_episodes];
         learning.map(grid).collect()
     };
-    assert_eq!(grids(quick.budget), [[2_000, 500, 10, 20]; 8], "four methods, two seeds");
+    assert_eq!(grids(quick.budget), [[2_000, 500, 10, 20]; 10], "five methods, two seeds");
     let larger = Budget { steps: 100_000, evaluate_every: 1_000, evaluation_episodes: 300, test_episodes: 300 };
-    assert_eq!(grids(Some(larger)), [[3_000, 1_000, 20, 100]; 8], "the presets say fewer");
-    assert_eq!(grids(None), [[3_000, 100, 20, 100]; 8]);
+    assert_eq!(grids(Some(larger)), [[3_000, 1_000, 20, 100]; 10], "the presets say fewer");
+    assert_eq!(grids(None), [[3_000, 100, 20, 100]; 10]);
     let never = StudyPlan { budget: Some(Budget { evaluate_every: 0, ..larger }), ..quick.clone() };
     assert!(never.runs(&registry).is_err_and(|problem| problem.to_string().contains("evaluate_every")));
 }

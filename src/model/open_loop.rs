@@ -61,7 +61,8 @@ pub struct OpenLoop {
     /// Time steps ahead.
     pub horizon: usize,
     /// Error of the predicted mean: root mean square over the features, each in units of the standard deviation of
-    /// its displacement over `horizon` time steps; median over start times. Predicting no change has an error of about 1.
+    /// its displacement over `horizon` time steps; median over start times. Predicting no change has a root mean square of
+    /// about 1 over start times, and a smaller median if little moves at many of them.
     #[doc(alias = "RMSE")]
     pub rmse: f64,
     /// Negative log-likelihood in nats, mean over features (in those units) and start times. The predicted distribution is a

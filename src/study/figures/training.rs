@@ -34,7 +34,7 @@ pub fn model(tables: &Tables, task: &str, method: &str, path: &Path) -> Result<b
     // A model that has learned nothing yet may be off by any factor: a logarithmic axis shows it.
     let least = drawn(&errors).filter(|error| *error > 0.0).fold(1.0, f64::min);
     let worst = drawn(&errors).fold(1.0, f64::max);
-    let error = over_training("open-loop prediction error (1: predicting no change)", &errors)
+    let error = over_training("open-loop error (1: std of the change)", &errors)
         .log_y()
         .between(0.8 * least, 1.25 * worst)
         .mark(1.0);

@@ -69,7 +69,7 @@ impl Registry {
         agents::register(envs::register(registry)).quick_study(
             &["reach"],
             // Runs start in this order. The longest come first, so that the cores finish at about the same time.
-            &["dreamer", "oracle", "tdmpc2", "pets", "sac", "scripted", "random"],
+            &["dreamer", "pets-learned", "oracle", "tdmpc2", "pets", "sac", "scripted", "random"],
             Some(Budget { steps: 2_000, evaluate_every: 500, evaluation_episodes: 10, test_episodes: 20 }),
         )
     }

@@ -33,9 +33,10 @@ pub(super) fn table(tables: &Tables, task: &str) -> Result<String> {
         horizons.iter().copied().map(heading).collect::<String>()
     });
     Ok(format!(
-        "\nThe learned models in the last evaluation: open-loop prediction error 1 to 25 time steps ahead, in standard deviations of the change (root \
-         mean square over features, median over start times; predicting no change has about 1), and coverage, the share of outcomes inside the \
-         90 % interval of models that have one. Median of the seeds [lowest, highest]. Particles that follow the means of their models \
+        "\nThe learned models in the last evaluation: open-loop prediction error 1 to 25 time steps ahead, in standard deviations \
+         of the change (root mean square over features, median over start times; predicting no change has a root mean square of \
+         about 1 over start times, and a smaller median if little moves at many of them), and coverage, the share of outcomes \
+         inside the 90 % interval of models that have one. Median of the seeds [lowest, highest]. Particles that follow the means of their models \
          (`ts-inf-mean`) leave out noise, so their interval covers less by design. The errors of `dreamer` and `tdmpc2` are those of \
          observations reconstructed from their latent states, which may lack what the agent does not need.\n\n\
          | method |{errors}{coverages}\n|{}\n{rows}",

@@ -60,8 +60,8 @@ fn diagnostics(tables: &Tables, task: &str, method: &str, to: &Path) -> Result<S
         let covered = !tables.model_curves(task, method, 1, "coverage90")?.is_empty();
         let coverage = if covered { ", and the coverage of its 90 % interval" } else { "" };
         text += &format!(
-            "![Open-loop prediction error of the model of {method} on the method's own evaluation episodes (thin: each seed), in standard deviations of the \
-             change (root mean square over features, median over start times; predicting no change has about 1){coverage}]({file})\n\n"
+            "![Open-loop prediction error of the model of {method} on the method's own evaluation episodes (thin: each seed), in \
+             standard deviations of the change (root mean square over features, median over start times){coverage}]({file})\n\n"
         );
     }
     let file = format!("{stem}-values.svg");
