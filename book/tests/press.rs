@@ -481,11 +481,11 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         ("chapters/12-study.md", format!("one of TD-MPC2 {}", earlier("reach", "tdmpc2"))),
         ("chapters/12-study.md", format!("one of Dreamer {}", earlier("reach", "dreamer"))),
     ]);
-    let [sac, pets, tdmpc2, dreamer] =
-        ["sac", "pets", "tdmpc2", "dreamer"].map(|method| in_study("quick", "reach", method, "seconds_to_80"));
+    let [sac, pets, learned, tdmpc2, dreamer] = ["sac", "pets", "pets-learned", "tdmpc2", "dreamer"]
+        .map(|method| in_study("quick", "reach", method, "seconds_to_80"));
     for file in ["README.md", "chapters/12-study.md"] {
         let seconds = format!(
-            "in the median after {sac:.0} s, PETS after {pets:.0} s, TD-MPC2 after {tdmpc2:.0} s and Dreamer after {dreamer:.0} s"
+            "in the median after {sac:.0} s, PETS after {pets:.0} s (with a learned reward {learned:.0} s), TD-MPC2 after {tdmpc2:.0} s and Dreamer after {dreamer:.0} s"
         );
         quotes.push((file, seconds));
     }
