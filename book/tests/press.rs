@@ -286,17 +286,19 @@ fn numbers_from_studies_are_quoted_as_they_are() {
     );
     quotes.push(("chapters/08-sac.md", successes));
     assert_eq!(test_successes("lift", "lift", "dreamer"), [100, 96, 100, 100, 99]);
-    let [dreamer, tdmpc2, pets] =
-        ["dreamer", "tdmpc2", "pets"].map(|method| ["reach", "lift"].map(|task| model_error(task, method, "15")));
+    let [dreamer, tdmpc2, pets] = ["dreamer", "tdmpc2", "pets"]
+        .map(|method| ["reach", "lift", "push"].map(|task| model_error(task, method, "15")));
     quotes.extend([
         (
             "README.md",
             format!(
-                "are {:.1} and {:.1} standard deviations of the change on `reach`, and {:.1} and {:.1} on `lift`; one step ahead on `lift`, where little changes, Dreamer's is {:.0} (medians",
+                "are {:.1} and {:.1} standard deviations of the change on `reach`, on `lift` {:.1} and {:.1}, and on `push` {:.1} and {:.1}; one step ahead on `lift`, where little changes, Dreamer's is {:.0} (medians",
                 dreamer[0],
                 tdmpc2[0],
                 dreamer[1],
                 tdmpc2[1],
+                dreamer[2],
+                tdmpc2[2],
                 model_error("lift", "dreamer", "1")
             ),
         ),
