@@ -227,11 +227,11 @@ fn numbers_from_studies_are_quoted_as_they_are() {
         quotes.push(("README.md", format!("| {name} | {success} | {steps} ({seeds}) | {ratio} | {sparc:.1} |")));
     }
     for (study, task, plan) in [
-        ("oracle", "reach", "4 actions, each held 2 steps | 2 x 20 | 45"),
-        ("oracle", "push", "10 actions, each held 3 steps; the final reward counts 100 times | 4 x 64 | 1,150"),
-        ("oracle", "lift", "8 knots of a spline, 3 steps apart; the final reward counts 5 times | 3 x 32 | 340"),
-        ("oracle", "stack", "12 knots, 4 steps apart; the final reward counts 20 times | 3 x 40 | 1,390"),
-        ("door", "door", "12 knots, 4 steps apart; the final reward counts 20 times | 3 x 40 | 1,100"),
+        ("oracle", "reach", "4 actions, each held 2 steps | 2 x 20 | 42"),
+        ("oracle", "push", "10 actions, each held 3 steps; the final reward counts 100 times | 4 x 64 | 810"),
+        ("oracle", "lift", "8 knots of a spline, 3 steps apart; the final reward counts 5 times | 3 x 32 | 230"),
+        ("oracle", "stack", "12 knots, 4 steps apart; the final reward counts 20 times | 3 x 40 | 800"),
+        ("door", "door", "12 knots, 4 steps apart; the final reward counts 20 times | 3 x 40 | 770"),
     ] {
         let episodes = in_study(study, task, "oracle", "test_episodes");
         let successes = test_successes(study, task, "oracle")[0];
