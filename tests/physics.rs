@@ -458,10 +458,10 @@ fn no_cube_is_pressed_into_the_table() {
         .collect();
     let mut depths: Vec<f64> = episodes.into_par_iter().map(|(task, seed)| pressed_in(task, seed)).collect();
     depths.sort_by(f64::total_cmp);
-    // Over 72,000 control steps each, with 66 shakes, it was 3.78 mm in one episode, and 2.73 mm at most in all others.
-    let [second, worst] = [2, 1].map(|from_last| 1e3 * depths[depths.len() - from_last]);
-    println!("pressed in by {worst:.2} mm, in other episodes by at most {second:.2}");
-    assert!(second < 3.0 && worst < 6.0, "pressed in by {worst:.2} and {second:.2} mm");
+    // Over 72,000 control steps each, with 65 shakes, it was 2.73 mm at most.
+    let worst = 1e3 * depths[depths.len() - 1];
+    println!("pressed in by {worst:.2} mm");
+    assert!(worst < 3.0, "pressed in by {worst:.2} mm");
 }
 
 /// Friction carries what the pads can carry, and no more: a cube falls out of a hand at rest with the acceleration
