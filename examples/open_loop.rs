@@ -12,7 +12,7 @@ use std::path::Path;
 use handful::agent::{DreamerConfig, Preset};
 use handful::chart::{Chart, PALETTE, Panels};
 use handful::env::{Env, Spec, Task, World};
-use handful::model::open_loop::{HORIZONS, OpenLoopModel, Propagated, open_loop};
+use handful::model::open_loop::{HORIZONS, OpenLoop, OpenLoopModel, Propagated, open_loop};
 use handful::model::{Autoencoder, AutoencoderConfig, Ensemble, EnsembleConfig, Propagation, WorldModel};
 use handful::nn::{Adam, AdamConfig};
 use handful::plan::noise::ColoredNoise;
@@ -93,8 +93,13 @@ struct Row {
     coverage90: Option<f64>,
 }
 
+/// Open-loop errors from the same start times for every model.
+fn errors(model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode]) -> Vec<OpenLoop> {
+    open_loop(model, spec, episodes, &mut rng::stream(0, "judge"))
+}
+
 fn evaluate(name: &'static str, model: &impl OpenLoopModel, spec: &Spec, episodes: &[Episode], rows: &mut Vec<Row>) {
-    for row in open_loop(model, spec, episodes, &mut rng::stream(0, "judge")) {
+    for row in errors(model, spec, episodes) {
         let (horizon, rmse, rmse_p90, coverage90) = (row.horizon, row.rmse, row.rmse_p90, row.coverage90);
         println!("  {name:12} {horizon:3} steps: error {rmse:.3}, 90th percentile {rmse_p90:.3}");
         rows.push(Row { model: name.into(), horizon, rmse, rmse_p90, coverage90 });
@@ -175,7 +180,7 @@ fn calibrate(task: Task, writer: &mut csv::Writer<std::fs::File>) -> Result<(), 
         ensemble.fit(&training.transitions, &mut rng);
         let dynamics = &ensemble.dynamics();
         for (propagation, _) in PROPAGATIONS {
-            for row in open_loop(&Propagated { dynamics, propagation }, spec, &held_out, &mut rng::stream(0, "judge")) {
+            for row in errors(&Propagated { dynamics, propagation }, spec, &held_out) {
                 let (horizon, rmse, nll, coverage90) = (row.horizon, row.rmse, row.nll, row.coverage90);
                 writer.serialize(CalibrationRow {
                     task: task.name().into(),

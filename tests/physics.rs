@@ -3,14 +3,14 @@
 
 use std::f64::consts::PI;
 
-use handful::env::arm::{ArmDescription, JointVector, Pose};
+use handful::env::arm::{ArmDescription, GripperDescription, JointVector, Pose};
 use handful::env::kinematics::{GRAVITY, KinematicModel, Kinematics};
 use handful::env::osc::{Goal, OperationalSpaceController};
 use handful::env::physics::{Physics, STEPS_PER_CONTROL, TABLE_HALF, TABLE_TOP, TIMESTEP};
 use handful::env::tabletop::{ActionKind, Door, Lift, TableOptions, Tabletop};
 use handful::env::{Env, Task, World};
 use handful::rng;
-use nalgebra::Vector3;
+use nalgebra::{Isometry3, Vector3};
 use rayon::prelude::*;
 use serde::Deserialize;
 
@@ -156,6 +156,28 @@ fn pose_actions() -> TableOptions {
     TableOptions { action: ActionKind::Pose, horizon: Some(10_000), ..TableOptions::default() }
 }
 
+/// One control step, with the forces of the fingers as a function of their positions. Returns the last pose of the hand that
+/// the controller has seen.
+fn control_step(
+    physics: &mut Physics,
+    controller: &OperationalSpaceController,
+    force: impl Fn(f64) -> f64,
+) -> Isometry3<f64> {
+    let mut measured = Isometry3::identity();
+    for _ in 0..STEPS_PER_CONTROL {
+        let joints = physics.joint_state();
+        let at = physics.kinematics(&joints.q);
+        measured = at.grip;
+        physics.step(&controller.torques(&at, &joints.q, &joints.qd), joints.fingers.map(&force));
+    }
+    measured
+}
+
+/// The gripper's servo, which drives a finger to a position.
+fn gripper_servo(gripper: &GripperDescription, target: f64) -> impl Fn(f64) -> f64 {
+    move |q| (gripper.stiffness * (target - q)).clamp(-gripper.max_force, gripper.max_force)
+}
+
 /// The hand's path (mm from the start) under robosuite's pose action, from rest at home without noise.
 fn response(action: [f32; 3], steps: usize) -> Vec<Vector3<f64>> {
     let arm = ArmDescription::panda();
@@ -168,12 +190,7 @@ fn response(action: [f32; 3], steps: usize) -> Vec<Vector3<f64>> {
     let mut path = Vec::new();
     for _ in 0..steps {
         controller.goal = Goal { position: measured.translation.vector + lead, orientation: measured.rotation };
-        for _ in 0..STEPS_PER_CONTROL {
-            let joints = physics.joint_state();
-            let at = physics.kinematics(&joints.q);
-            measured = at.grip;
-            physics.step(&controller.torques(&at, &joints.q, &joints.qd), [0.0; 2]);
-        }
+        measured = control_step(&mut physics, &controller, |_| 0.0);
         let now = physics.kinematics(&physics.joint_state().q).grip;
         path.push((now.translation.vector - start.translation.vector) * 1e3);
     }
@@ -203,12 +220,7 @@ fn the_fingers_move_as_in_robosuite() {
         let mut target = trace.target_mm / 1e3;
         for (i, theirs) in trace.mm.iter().enumerate() {
             target = (target - trace.action * gripper.target_step).clamp(0.0, 0.04);
-            for _ in 0..STEPS_PER_CONTROL {
-                let joints = physics.joint_state();
-                let torques = controller.torques(&physics.kinematics(&joints.q), &joints.q, &joints.qd);
-                let servo = |q: f64| (gripper.stiffness * (target - q)).clamp(-gripper.max_force, gripper.max_force);
-                physics.step(&torques, joints.fingers.map(servo));
-            }
+            control_step(&mut physics, &controller, gripper_servo(gripper, target));
             for finger in physics.joint_state().fingers {
                 close(&format!("{}, step {}: mm", trace.name, i + 1), finger * 1e3, *theirs, 1.0);
             }
@@ -248,13 +260,7 @@ fn the_hand_follows_unseen_paths_of_robosuite() {
                 orientation: measured.rotation,
             };
             opening = (opening - closes * gripper.target_step).clamp(0.0, 0.04);
-            for _ in 0..STEPS_PER_CONTROL {
-                let joints = physics.joint_state();
-                let at = physics.kinematics(&joints.q);
-                measured = at.grip;
-                let servo = |q: f64| (gripper.stiffness * (opening - q)).clamp(-gripper.max_force, gripper.max_force);
-                physics.step(&controller.torques(&at, &joints.q, &joints.qd), joints.fingers.map(servo));
-            }
+            measured = control_step(&mut physics, &controller, gripper_servo(gripper, opening));
             let now = physics.joint_state();
             let grip = physics.kinematics(&now.q).grip.translation.vector;
             hand.push((grip - Vector3::new(x, y, z)).norm() * 1e3);
